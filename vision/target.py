@@ -136,9 +136,8 @@ class RingTarget:
     def to_toml(self) -> str:
         """Return the text of a ``target.toml``. Law: ``RingTarget.from_toml(t.to_toml()) == t``."""
         return (
-            "# Concentric red rings on a white board: edge radii from the outside in, red between the 1st and
-            2nd,\n" "# the 3rd and 4th, ...; metres. MEASURE the print and correct the radii: an error of 1 %
-            is an error of\n" "# 1 % in every distance.\n"
+            "# Concentric red rings on a white board: edge radii [m] from the outside in, red between the 1st and\n"
+            "# 2nd, the 3rd and 4th, ... MEASURE the print and correct the radii: 1 % there is 1 % of distance.\n"
             f"name = {msgspec.json.encode(self.name).decode()}\n"
             f"edges_m = [{', '.join(repr(r) for r in self.edges_m)}]\n"
             f"board_m = {self.side_m!r}\n"
