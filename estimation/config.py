@@ -1,0 +1,336 @@
+"""Configuration: every parameter with its unit, its meaning and the reason for its default.
+
+Files are TOML and strict: an unknown key is refused with the nearest valid name, a value outside its bounds with
+the bound. Process noise is always a rate (per root second or per root hertz), so that it does not depend on the
+rate of the sensor; the descriptions say which 1-sigma it means after 1 s and 10 s.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Meta
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the key, what is wrong and what to do."""
+
+
+def _positive(description: str, unit: str) -> Meta:
+    return Meta(gt=0.0, description=description, extra={"unit": unit})
+
+
+def _number(description: str, unit: str) -> Meta:
+    return Meta(description=description, extra={"unit": unit})
+
+
+def _not_negative(description: str, unit: str) -> Meta:
+    return Meta(ge=0.0, description=description, extra={"unit": unit})
+
+
+def _choice(description: str) -> Meta:
+    return Meta(description=description, extra={"unit": "-"})
+
+
+Vector3 = tuple[float, float, float]
+
+
+class _Table(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """A table of the file."""
+
+
+class Origin(_Table):
+    """Origin of the filter's NED frame; without one it is the first good GPS fix."""
+
+    latitude_deg: Annotated[
+        float | None, _number("WGS-84 latitude of the anchor; None: first good GPS fix", "deg")
+    ] = None
+    longitude_deg: Annotated[float | None, _number("WGS-84 longitude of the anchor", "deg")] = None
+    altitude_m: Annotated[
+        float | None, _number("altitude of the mean deck or sea level, in the datum of the GPS", "m")
+    ] = None
+
+
+class ImuConfig(_Table):
+    """Inertial sensor. Also what the simulator draws its IMU from."""
+
+    accel_noise: Annotated[
+        float,
+        _positive("white noise of specific force; 0.01 means 0.01 m/s after 1 s, 0.03 m/s after 10 s", "m/s^2/rtHz"),
+    ] = 0.01
+    gyro_noise: Annotated[
+        float, _positive("white noise of angular velocity; 5e-4 means 0.03 deg after 1 s, 0.09 deg after 10 s", "rad/s/rtHz")
+    ] = 5e-4
+    accel_bias_walk: Annotated[
+        float, _not_negative("random walk of the accelerometer bias; 5e-4: 1.6 mm/s^2 after 10 s", "m/s^2/rts")
+    ] = 5e-4
+    gyro_bias_walk: Annotated[
+        float, _not_negative("random walk of the gyro bias; 9e-5: 0.016 deg/s after 10 s", "rad/s/rts")
+    ] = 9e-5
+    accel_bias_sigma: Annotated[
+        float,
+        _positive("1-sigma of the accelerometer bias at start; it cannot be told from tilt in hover", "m/s^2"),
+    ] = 0.03
+    gyro_bias_sigma: Annotated[
+        float, _positive("1-sigma of the gyro bias at start when it was not averaged at rest", "rad/s")
+    ] = 5e-3
+    vibration_gain: Annotated[
+        float,
+        _not_negative(
+            "share of the measured sample-to-sample scatter that is added to the white noise (0: off). A vibrating "
+            "airframe aliases into the specific force; 1 takes the scatter as white",
+            "-",
+        ),
+    ] = 1.0
+    latency_s: Annotated[
+        float | None,
+        _number("age of a sample at its stamp (filter delay); None: as the log says, else 0", "s"),
+    ] = None
+    gap_s: Annotated[
+        float, _positive("longest gap that is bridged; a longer one starts a new alignment", "s")
+    ] = 0.5
+
+
+class GpsConfig(_Table):
+    """GPS position and velocity."""
+
+    latency_s: Annotated[float, _not_negative("age of a fix at its stamp", "s")] = 0.105
+    lever_arm_m: Annotated[Vector3, _number("antenna relative to the IMU, body FRD", "m")] = (0.0, 0.0, 0.0)
+    position_sigma_m: Annotated[
+        float, _positive("white horizontal noise where the receiver states none, and its floor", "m")
+    ] = 0.5
+    height_sigma_m: Annotated[
+        float, _positive("white vertical noise where the receiver states none, and its floor", "m")
+    ] = 2.0
+    velocity_sigma_mps: Annotated[
+        float, _positive("white horizontal velocity noise where none is stated, and its floor", "m/s")
+    ] = 0.15
+    climb_sigma_mps: Annotated[
+        float, _positive("white vertical velocity noise where none is stated, and its floor", "m/s")
+    ] = 0.3
+    white_fraction: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=1.0,
+            description="share of the receiver's stated position accuracy that is white; the rest is slow and is "
+            "what the bias states carry",
+            extra={"unit": "-"},
+        ),
+    ] = 0.4
+    bias: Annotated[bool, _choice("carry a slowly wandering position error as a state")] = True
+    bias_sigma_m: Annotated[float, _positive("stationary 1-sigma of the horizontal position error", "m")] = 0.5
+    height_bias_sigma_m: Annotated[
+        float, _positive("stationary 1-sigma of the vertical position error", "m")
+    ] = 3.0
+    bias_time_s: Annotated[float, _positive("correlation time of the position error", "s")] = 120.0
+    max_accuracy_m: Annotated[
+        float, _positive("a fix that states a worse horizontal accuracy is not used", "m")
+    ] = 50.0
+    reset_after_s: Annotated[
+        float,
+        _positive(
+            "fixes that agree with each other, but not with the filter, for this long move its position (never its "
+            "attitude); a note says so",
+            "s",
+        ),
+    ] = 5.0
+
+
+class BarometerConfig(_Table):
+    """Barometric height; its offset is a state."""
+
+    use: Annotated[bool, _choice("fuse the barometer")] = True
+    latency_s: Annotated[float, _not_negative("age of a reading at its stamp", "s")] = 0.0
+    sigma_m: Annotated[float, _positive("white noise of the height", "m")] = 0.15
+    bias_walk: Annotated[
+        float, _not_negative("random walk of the offset (weather); 0.02: 0.06 m after 10 s", "m/rts")
+    ] = 0.02
+    bias_sigma_m: Annotated[float, _positive("1-sigma of the offset at start, once aligned", "m")] = 3.0
+
+
+class MagnetometerConfig(_Table):
+    """Heading from the magnetic field."""
+
+    use: Annotated[bool, _choice("fuse the magnetometer's heading")] = True
+    latency_s: Annotated[float, _not_negative("age of a reading at its stamp", "s")] = 0.0
+    heading_sigma_rad: Annotated[float, _positive("1-sigma of the heading", "rad")] = 0.052
+    declination_deg: Annotated[
+        float | None,
+        _number("east positive; None: as the log says, else the World Magnetic Model", "deg"),
+    ] = None
+
+
+class AttitudeConfig(_Table):
+    """Attitude from the autopilot's own estimator."""
+
+    use: Annotated[
+        Literal["off", "initialise", "fuse"],
+        _choice("'initialise' only starts from it when the flight begins in the air"),
+    ] = "initialise"
+    latency_s: Annotated[float, _not_negative("age of an attitude at its stamp", "s")] = 0.0
+    tilt_sigma_rad: Annotated[float, _positive("1-sigma of roll and pitch", "rad")] = 0.02
+    yaw_sigma_rad: Annotated[float, _positive("1-sigma of yaw", "rad")] = 0.1
+
+
+class RangefinderConfig(_Table):
+    """Downward rangefinder over a surface of known height."""
+
+    use: Annotated[bool, _choice("fuse the rangefinder; needs a level surface below")] = False
+    latency_s: Annotated[float, _not_negative("age of a range at its stamp", "s")] = 0.0
+    sigma_m: Annotated[float, _positive("1-sigma at zero range", "m")] = 0.05
+    sigma_per_m: Annotated[float, _not_negative("growth of the 1-sigma with range", "-")] = 0.01
+    lever_arm_m: Annotated[Vector3, _number("sensor relative to the IMU, body FRD", "m")] = (0.0, 0.0, 0.0)
+    surface_height_m: Annotated[float, _number("height of the surface above the origin", "m")] = 0.0
+
+
+class FilterConfig(_Table):
+    """The filter itself."""
+
+    window_s: Annotated[
+        float,
+        Meta(ge=0.1, le=5.0, description="how late an event may be and still be fused at its own time", extra={"unit": "s"}),
+    ] = 0.5
+    huber_sigma: Annotated[
+        float,
+        _positive("innovations beyond this many sigma (of equal probability in one dimension) weigh less", "-"),
+    ] = 3.0
+    gate_sigma: Annotated[
+        float,
+        Meta(
+            gt=0.0,
+            le=8.0,
+            description="innovations beyond this many sigma (of equal probability in one dimension) are rejected",
+            extra={"unit": "-"},
+        ),
+    ] = 6.0
+    output_rate_hz: Annotated[
+        float, _not_negative("rate of the estimates that come out; 0: one for each inertial sample", "Hz")
+    ] = 50.0
+    gravity_mps2: Annotated[
+        float | None, _number("magnitude of gravity; None: WGS-84 at the origin", "m/s^2")
+    ] = None
+
+
+class InitialisationConfig(_Table):
+    """How the filter starts."""
+
+    rest_s: Annotated[float, _positive("time over which rest is judged and the start averaged", "s")] = 1.0
+    tilt_sigma_rad: Annotated[float, _positive("1-sigma of roll and pitch levelled at rest", "rad")] = 0.01
+    flight_tilt_sigma_rad: Annotated[float, _positive("1-sigma of roll and pitch levelled in flight", "rad")] = 0.05
+    yaw_sigma_rad: Annotated[
+        float, _positive("1-sigma of the first yaw; also how well it must be known before the start", "rad")
+    ] = 0.09
+
+
+class Config(_Table):
+    """Everything the estimator needs to know that is not in a measurement."""
+
+    origin: Origin = Origin()
+    imu: ImuConfig = ImuConfig()
+    gps: GpsConfig = GpsConfig()
+    barometer: BarometerConfig = BarometerConfig()
+    magnetometer: MagnetometerConfig = MagnetometerConfig()
+    attitude: AttitudeConfig = AttitudeConfig()
+    rangefinder: RangefinderConfig = RangefinderConfig()
+    filter: FilterConfig = FilterConfig()
+    initialisation: InitialisationConfig = InitialisationConfig()
+
+    def __post_init__(self) -> None:
+        """Check what a single field cannot: raises ``ConfigError``."""
+        given = [self.origin.latitude_deg, self.origin.longitude_deg, self.origin.altitude_m]
+        if any(v is None for v in given) and any(v is not None for v in given):
+            raise ConfigError("origin: give latitude_deg, longitude_deg and altitude_m, or none of them")
+        if self.filter.huber_sigma > self.filter.gate_sigma:
+            raise ConfigError("filter.huber_sigma is above filter.gate_sigma; make it smaller")
+        for table in self.__struct_fields__:
+            for name in getattr(self, table).__struct_fields__:
+                value = getattr(getattr(self, table), name)
+                for number in value if isinstance(value, tuple) else (value,):
+                    if isinstance(number, float) and not math.isfinite(number):
+                        raise ConfigError(f"{table}.{name} is {number}; give a finite number")
+
+
+def parse_config(text: str, source: str = "configuration") -> Config:
+    """Return the configuration that a TOML text describes.
+
+    Raises ``ConfigError`` with the source's name, the key and the remedy.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: not valid TOML ({error}); correct that line") from None
+    _refuse_unknown(data, Config, source, ())
+    try:
+        return msgspec.convert(data, Config, strict=False)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {error}; correct that value") from None
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
+
+
+def load_config(path: str | Path) -> Config:
+    """Return the configuration in a TOML file; raises ``ConfigError``."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give the path of a TOML configuration") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error}); give a UTF-8 TOML file") from None
+    return parse_config(text, str(path))
+
+
+def dump_config(config: Config) -> str:
+    """Return the configuration as TOML, each parameter with its unit and meaning as a comment.
+
+    Law: ``parse_config(dump_config(c)) == c``.
+    """
+    lines: list[str] = []
+    for table, kind in _fields(Config):
+        struct = getattr(config, table)
+        lines.append(f"[{table}]")
+        for name, annotation in _fields(kind):
+            value = getattr(struct, name)
+            meta = next((m for m in get_args(annotation) if isinstance(m, Meta)), None)
+            if meta is not None:
+                unit = (meta.extra or {}).get("unit", "-")
+                lines.append(f"# {meta.description} [{unit}]")
+            lines.append(f"# {name} =" if value is None else f"{name} = {_toml(value)}")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    return repr(value)
+
+
+def _fields(kind: Any) -> list[tuple[str, Any]]:
+    hints = get_type_hints(kind, include_extras=True)
+    return [(name, hints[name]) for name in kind.__struct_fields__]
+
+
+def _refuse_unknown(data: dict[str, Any], kind: Any, source: str, path: tuple[str, ...]) -> None:
+    fields = dict(_fields(kind))
+    for key, value in data.items():
+        name = ".".join((*path, key))
+        if key not in fields:
+            near = difflib.get_close_matches(key, list(fields), n=1, cutoff=0.5)
+            hint = f"did you mean {'.'.join((*path, near[0]))!r}?" if near else f"valid: {', '.join(fields)}"
+            raise ConfigError(f"{source}: unknown key {name!r}; {hint}")
+        inner = fields[key]
+        inner = get_args(inner)[0] if get_origin(inner) is Annotated else inner
+        if isinstance(inner, type) and issubclass(inner, msgspec.Struct):
+            if not isinstance(value, dict):
+                raise ConfigError(f"{source}: {name!r} is a table; write [{name}]")
+            _refuse_unknown(value, inner, source, (*path, key))

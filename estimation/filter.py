@@ -1,0 +1,182 @@
+"""The reference engine: an error-state EKF on ``filterpy.kalman.ExtendedKalmanFilter``.
+
+Between updates the filter's ``x`` is the error state and zero; the nominal state beside it is what moves. This is
+the engine that is easy to read, and the one that takes sensors defined by the user; ``estimation.compiled`` does
+the same in compiled code.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from estimation import models, update
+from estimation.frames import Array
+from estimation.outcome import Outcome
+from estimation.rows import Estimates, FilterState, Rows
+from estimation.state import ATTITUDE, Layout, plus
+
+if TYPE_CHECKING:
+    from filterpy.kalman import ExtendedKalmanFilter
+
+IMU = 0
+USER = 9
+
+Model = Callable[[Array, Array, Layout], tuple[Array, Array, Array]]
+"""(value, nominal state, layout) -> innovation (m,), Jacobian (m, n), covariance (m, m); m is 1 to 3."""
+
+
+@dataclass(slots=True)
+class FilterPyEngine:
+    """Processes rows in order with filterpy's EKF.
+
+    ``p`` is the parameter vector, ``users`` maps a sensor's index to the user's model.
+    """
+
+    p: Array
+    layout: Layout
+    state: FilterState
+    users: Mapping[int, Model]
+    ekf: ExtendedKalmanFilter
+
+    @classmethod
+    def start(cls, p: Array, layout: Layout, state: FilterState, users: Mapping[int, Model] | None = None) -> FilterPyEngine:
+        """Return an engine at a state; imports filterpy."""
+        return cls(p, layout, state, users or {}, _ekf(layout.size))
+
+    def save(self) -> FilterState:
+        """Return a checkpoint."""
+        return self.state.copy()
+
+    def load(self, saved: FilterState) -> None:
+        """Go back to a checkpoint."""
+        self.state = saved.copy()
+
+    def advance(self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int) -> None:
+        """Process the rows start..stop in order; the last must be an inertial sample.
+
+        An estimate is written for each inertial sample later than ``emit_after_ns`` that begins a new period
+        (every one for ``period_ns`` 0).
+        """
+        s = self.state
+        following = start
+        for i in range(start, stop):
+            if following <= i:
+                following = i
+                while rows.kind[following] != IMU:
+                    following += 1
+            t_imu, imu = int(rows.t_ns[following]), rows.value[following]
+            t = int(rows.t_ns[i])
+            self._propagate(t, t_imu, imu)
+            if i < following:
+                gyro = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, t)[:3]
+                self._fuse(rows, i, gyro)
+                continue
+            update.scatter_update(s.scatter, s.imu, imu, (t - int(s.clock[1])) * 1e-9)
+            new_period = period_ns == 0 or t // period_ns != int(s.clock[1]) // period_ns
+            s.clock[1] = t
+            s.imu = imu.copy()
+            if t > emit_after_ns and new_period:
+                _write(out, t, s.x, s.P)
+            following = i + 1
+
+    def _propagate(self, t: int, t_imu: int, imu: Array) -> None:
+        s = self.state
+        total = t - int(s.clock[0])
+        if total <= 0:
+            return
+        n = self.layout.size
+        steps = max(1, math.ceil(total * 1e-9 / update.MAX_STEP_S))
+        extra = update.extra_noise(s.scatter, (t_imu - int(s.clock[1])) * 1e-9, self.p)
+        F, Q = np.empty((n, n)), np.empty((n, n))
+        a = int(s.clock[0])
+        dt = total * 1e-9 / steps
+        for k in range(steps):
+            middle = a + total * ((k + 0.5) / steps)
+            mean = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, middle)
+            s.x = models.transition(s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q)
+            self.ekf.P = s.P
+            self.ekf.F = F
+            self.ekf.Q = Q
+            self.ekf.predict()
+            s.P = 0.5 * (self.ekf.P + self.ekf.P.T)
+        s.clock[0] = t
+
+    def _fuse(self, rows: Rows, i: int, gyro: Array) -> None:
+        s, n, kind = self.state, self.layout.size, int(rows.kind[i])
+        r, H, R = np.zeros(3), np.zeros((3, n)), np.zeros((3, 3))
+        if kind == USER:
+            user = self.users.get(int(rows.sensor[i]))
+            m = models.UNUSABLE_NOW
+            if user is not None:
+                ru, Hu, Ru = user(rows.value[i], s.x, self.layout)
+                m = len(ru)
+                r[:m], H[:m], R[:m, :m] = ru, Hu, Ru
+        else:
+            m = models.measure(kind, rows.value[i], rows.own[i], s.x, gyro, self.p, self.layout.offsets, r, H, R)
+        rows.result[i] = 0.0
+        rows.reset[i] = 0
+        if m < 0:
+            rows.outcome[i] = -m
+            return
+        r, H, R = r[:m], H[:m], R[:m, :m]
+        S = H @ s.P @ H.T + R
+        nis = float(r @ np.linalg.solve(S, r))
+        rows.result[i, 0] = nis
+        rows.result[i, 1] = m
+        rows.result[i, 2 : 2 + m] = r
+        rows.result[i, 5 : 5 + m] = np.sqrt(np.diag(S))
+        w = update.weight(nis, m, self.p)
+        lock = s.lock[rows.sensor[i]]
+        if w == 0.0:
+            t_s = (int(rows.t_ns[i]) - int(s.clock[2])) * 1e-9
+            rows.outcome[i] = Outcome.REJECTED_GATE
+            if update.locked_out(lock, kind, t_s, r, m, self.p):
+                update.reset_datum(kind, s.x, s.P, r, R, m, self.layout.offsets)
+                lock[0] = 0.0
+                rows.reset[i] = 1
+                rows.outcome[i] = Outcome.FUSED_LATE if rows.late[i] else Outcome.FUSED
+            return
+        lock[0] = 0.0
+        rows.outcome[i] = Outcome.FUSED_LATE if rows.late[i] else Outcome.FUSED
+        if w < 1.0:
+            rows.outcome[i] = Outcome.DOWNWEIGHTED
+        ekf = self.ekf
+        ekf.x = np.zeros(n)
+        ekf.P = s.P
+        ekf.update(r, lambda _: H, lambda _: np.zeros(m), R=R / w)
+        error = ekf.x
+        s.x = plus(s.x, error, self.layout.offsets)
+        P = ekf.P
+        att = int(self.layout.offsets[ATTITUDE])
+        G = models.right_jacobian(error[att : att + 3])
+        P[att : att + 3, :] = G @ P[att : att + 3, :]
+        P[:, att : att + 3] = P[:, att : att + 3] @ G.T
+        s.P = 0.5 * (P + P.T)
+
+
+def _ekf(n: int) -> Any:
+    from filterpy.kalman import ExtendedKalmanFilter
+
+    class ErrorStateEKF(ExtendedKalmanFilter):  # type: ignore[misc]
+        """filterpy's EKF whose state is the error: zero before each update, so predicting it is nothing."""
+
+        def predict_x(self, u: object = 0) -> None:
+            """Leave the error state as it is; the nominal state is propagated by the model."""
+
+    ekf = ErrorStateEKF(dim_x=n, dim_z=3)
+    ekf.x = np.zeros(n)
+    return ekf
+
+
+def _write(out: Estimates, t: int, x: Array, P: Array) -> None:
+    k = out.count
+    out.t_ns[k] = t
+    out.x[k] = x
+    out.sigma[k] = np.sqrt(np.diag(P))
+    out.covariance[k] = P[:9, :9]
+    out.count = k + 1

@@ -1,0 +1,133 @@
+"""What both engines do around the filter's algebra: interpolating the IMU, gating, lock-out and its recovery.
+
+Plain functions of arrays that numba compiles as they stand.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from estimation import parameters as par
+from estimation.frames import Array
+from estimation.models import BAROMETER, GPS_POSITION, GPS_VELOCITY
+from estimation.state import BARO_BIAS, BB0, GPS_BIAS, P0, POSITION, V0, VELOCITY, Offsets
+
+MAX_STEP_S = 0.025
+"""Longest step of the strapdown integration [s]; longer intervals are cut."""
+LONG_STEP_S = 0.05
+"""An interval between inertial samples beyond this [s] is a gap: its unknown motion is added as noise."""
+GAP_ACCEL = 2.0
+"""Unknown specific force in a gap [m/s^2], 1-sigma."""
+GAP_RATE = 0.5
+"""Unknown angular velocity in a gap [rad/s], 1-sigma."""
+SCATTER_TIME_S = 1.0
+"""Averaging time of the vibration measure [s]."""
+RESET_COUNT = 5
+"""Rejected measurements that must agree before a reset."""
+
+LOCK_SIZE = 6
+"""Entries per sensor of the lock-out memory: count, first and last time [s], last innovation (3)."""
+
+
+def interpolate(imu0: Array, t0: int, imu1: Array, t1: int, t: float) -> Array:
+    """Return the inertial sample (6,) at ``t`` [ns] on the line from (t0, imu0) to (t1, imu1)."""
+    if t1 <= t0:
+        return imu1.copy()
+    return imu0 + (imu1 - imu0) * ((t - t0) / (t1 - t0))
+
+
+def scatter_update(scatter: Array, imu0: Array, imu1: Array, dt: float) -> None:
+    """Update in place the vibration measure: mean variance of white noise that explains the sample differences.
+
+    ``scatter`` is (accelerometer, gyro) [(m/s^2)^2, (rad/s)^2] per axis; half the mean squared difference of
+    neighbouring samples, averaged over ``SCATTER_TIME_S``.
+    """
+    alpha = 1.0 - math.exp(-dt / SCATTER_TIME_S)
+    gyro = 0.0
+    accel = 0.0
+    for i in range(3):
+        gyro += (imu1[i] - imu0[i]) ** 2
+        accel += (imu1[3 + i] - imu0[3 + i]) ** 2
+    scatter[0] += alpha * (accel / 6.0 - scatter[0])
+    scatter[1] += alpha * (gyro / 6.0 - scatter[1])
+
+
+def extra_noise(scatter: Array, dt_imu: float, p: Array) -> Array:
+    """Return the noise densities squared (accelerometer, gyro) to add for vibration and for gaps.
+
+    A scatter of variance s^2 in samples dt apart, taken as white, has the density s^2 dt.
+    """
+    extra = np.empty(2)
+    extra[0] = p[par.VIBRATION_GAIN] * scatter[0] * dt_imu
+    extra[1] = p[par.VIBRATION_GAIN] * scatter[1] * dt_imu
+    if dt_imu > LONG_STEP_S:
+        extra[0] += GAP_ACCEL**2 * dt_imu
+        extra[1] += GAP_RATE**2 * dt_imu
+    return extra
+
+
+def weight(nis: float, dimension: int, p: Array) -> float:
+    """Return 1 for a likely innovation, less (Huber) for an unlikely one, 0 outside the gate.
+
+    The covariance is divided by the weight.
+    """
+    if not nis <= p[par.GATE_1 + dimension - 1]:
+        return 0.0
+    bound = p[par.HUBER_1 + dimension - 1]
+    return 1.0 if nis <= bound else math.sqrt(bound / nis)
+
+
+def locked_out(lock: Array, kind: int, t_s: float, r: Array, dimension: int, p: Array) -> bool:
+    """Note a rejection; return True when the sensor has contradicted the filter, but not itself, for too long.
+
+    ``lock`` is the sensor's own memory. Only sensors that carry a datum (GPS, barometer) can ever be right against
+    the filter; no number of rejections lets any other sensor in.
+    """
+    if kind == GPS_POSITION:
+        tolerance = 5.0
+    elif kind in (GPS_VELOCITY, BAROMETER):
+        tolerance = 2.0
+    else:
+        return False
+    change = 0.0
+    for i in range(dimension):
+        change += (r[i] - lock[3 + i]) ** 2
+    if lock[0] == 0.0 or math.sqrt(change) > tolerance + 2.0 * (t_s - lock[2]):
+        lock[0] = 0.0
+        lock[1] = t_s
+    lock[0] += 1.0
+    lock[2] = t_s
+    for i in range(dimension):
+        lock[3 + i] = r[i]
+    return lock[0] >= RESET_COUNT and t_s - lock[1] >= p[par.GPS_RESET_AFTER]
+
+
+def reset_datum(kind: int, x: Array, P: Array, r: Array, R: Array, dimension: int, offsets: Offsets) -> None:
+    """Move the state's datum onto a sensor that was locked out, in place, and forget what hung on the old one.
+
+    Position (velocity, barometer offset) takes the innovation; its correlations with all else are cut, so that
+    attitude and biases keep what they know.
+    """
+    if kind == GPS_POSITION:
+        block, place = offsets[POSITION], P0
+    elif kind == GPS_VELOCITY:
+        block, place = offsets[VELOCITY], V0
+    else:
+        block, place = offsets[BARO_BIAS], BB0
+    for i in range(dimension):
+        x[place + i] += r[i]
+        P[block + i, :] = 0.0
+        P[:, block + i] = 0.0
+        P[block + i, block + i] = R[i, i]
+    bias = offsets[GPS_BIAS]
+    if kind == GPS_POSITION and bias >= 0:
+        # position = fix - bias: what is not known of the bias is not known of the position.
+        for i in range(dimension):
+            for j in range(dimension):
+                P[block + i, block + j] += P[bias + i, bias + j]
+                P[block + i, bias + j] = -P[bias + i, bias + j]
+                P[bias + j, block + i] = -P[bias + i, bias + j]
+    elif kind == BAROMETER:
+        P[block, block] += P[offsets[POSITION] + 2, offsets[POSITION] + 2]
