@@ -1,0 +1,560 @@
+"""What the camera sees: a ring target on a deck on the sea, with exact geometry.
+
+Every pixel's ray meets the deck's plane exactly (any camera, lens distortion and rolling shutter included),
+and the edges of rings, board and deck are drawn by the exact area that they cover of a pixel
+(``coverage.py``). Light is mixed where light mixes, before the camera's gamma, and clips at 255 where it is
+too bright.
+
+Order of effects: geometry, light level and colour cast, shadow, glare, bar, lens and motion blur, sensor
+noise, gamma and clipping, JPEG. Colours are what the camera reports at light level 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from simulation.coverage import PlaneMap, disc, square
+from vision.camera import Camera, check_rotation
+from vision.target import RingTarget
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+_EDGE = 128
+_CODES = 8192
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What stands still from frame to frame.
+
+    ``deck_m`` is the side of the square deck [m] (2.4 target diameters where not given), ``freeboard_m`` its
+    height above the sea. Colours are RGB 0..255. ``sea_contrast`` scales the waves and glints (0: a flat
+    sea).
+    """
+
+    deck_m: float | None = None
+    freeboard_m: float = 0.4
+    deck_rgb: Colour = (118, 122, 120)
+    sea_rgb: Colour = (38, 82, 120)
+    sky_rgb: Colour = (170, 190, 210)
+    sea_contrast: float = 1.0
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        if self.deck_m is not None and not (math.isfinite(self.deck_m) and self.deck_m > 0.0):
+            raise ValueError(f"deck_m: {self.deck_m!r} is not a positive length")
+        if not (math.isfinite(self.freeboard_m) and self.freeboard_m >= 0.0):
+            raise ValueError(f"freeboard_m: {self.freeboard_m!r} is not a height above the sea")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What differs from frame to frame. The defaults are a sharp daylight picture with a little noise.
+
+    Lengths "of the target" are in its outer radius as it appears at its centre, angles in the image are rad
+    from the u axis towards v.
+
+    Parameters
+    ----------
+    light
+        Light level; whites clip at 255 above about 1.04.
+    cast_rgb
+        Factors on R, G, B: (1.2, 1, 0.7) is warm.
+    gamma
+        2.2 mixes light linearly and then encodes it; 1 is a camera that reports light itself.
+    shadow, shadow_offset, shadow_angle_rad
+        Factor on the light in the shaded half plane (1: none), distance of its edge from the target's centre
+        (of the target), direction in which the shadow lies.
+    glare, glare_radius, glare_offset
+        Peak of a Gaussian blob of white light added (1: full white), its sigma and its place (of the target).
+    bar_px, bar_offset, bar_angle_rad, bar_rgb
+        Width of a straight occluding bar across the picture (0: none), its middle's distance from the
+        target's centre (of the target), its direction, its colour.
+    defocus_px
+        Sigma of the lens's blur.
+    motion_px, motion_angle_rad
+        Length and direction of motion blur.
+    read_noise, shot_noise
+        Noise in units of 8 bits: variance = read_noise**2 + shot_noise * value.
+    distractors, boats
+        Number of red discs, ellipses and rings, and of boats, drawn at random places on the sea.
+    jpeg_quality
+        0..100, None for no compression.
+    target
+        False leaves the deck out altogether.
+    """
+
+    light: float = 1.0
+    cast_rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    gamma: float = 1.0
+    shadow: float = 1.0
+    shadow_offset: float = 0.0
+    shadow_angle_rad: float = 0.5
+    glare: float = 0.0
+    glare_radius: float = 0.25
+    glare_offset: tuple[float, float] = (0.3, 0.2)
+    bar_px: float = 0.0
+    bar_offset: float = 0.3
+    bar_angle_rad: float = 0.4
+    bar_rgb: Colour = (25, 25, 28)
+    defocus_px: float = 0.5
+    motion_px: float = 0.0
+    motion_angle_rad: float = 0.0
+    read_noise: float = 2.0
+    shot_noise: float = 0.0
+    distractors: int = 0
+    boats: int = 0
+    jpeg_quality: int | None = None
+    target: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("light", "gamma"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise ValueError(f"{name}: {getattr(self, name)!r} is not positive")
+        for name in (
+            "shadow",
+            "glare",
+            "glare_radius",
+            "bar_px",
+            "defocus_px",
+            "motion_px",
+            "read_noise",
+            "shot_noise",
+        ):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ValueError(f"{name}: {getattr(self, name)!r} is negative or not finite")
+        if len(self.cast_rgb) != 3 or not all(math.isfinite(c) and c >= 0.0 for c in self.cast_rgb):
+            raise ValueError(f"cast_rgb: {self.cast_rgb!r} is not three factors")
+        if self.jpeg_quality is not None and not 0 <= self.jpeg_quality <= 100:
+            raise ValueError(f"jpeg_quality: {self.jpeg_quality!r} is not from 0 to 100")
+
+
+class Renderer:
+    """Renders one target through one camera; keeps what does not change between frames."""
+
+    def __init__(self, camera: Camera, target: RingTarget, scene: Scene | None = None) -> None:
+        self.camera, self.target = camera, target
+        self.scene = Scene() if scene is None else scene
+        self.deck_m = 2.4 * target.diameter_m if self.scene.deck_m is None else self.scene.deck_m
+        if self.deck_m < target.side_m:
+            raise ValueError(f"deck_m: {self.deck_m} m of deck do not hold the board of {target.side_m} m")
+        generator = np.random.default_rng(self.scene.seed)
+        self._sea = _sea_texture(self.scene, generator)
+        self._bank = generator.standard_normal(camera.width * camera.height * 3 + (1 << 20), dtype=np.float32)
+        table = camera.ray_table
+        self._slopes = np.gradient(table, axis=1), np.gradient(table, axis=0)
+        self._coarse_rays = np.ascontiguousarray(table[::2, ::2])
+
+    def render(
+        self,
+        R_nc: ArrayLike,
+        position_m: ArrayLike,
+        rng: np.random.Generator | None = None,
+        conditions: Conditions | None = None,
+        R_nd: ArrayLike | None = None,
+        rate_c_radps: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Image:
+        """Return the picture, uint8 BGR of shape (height, width, 3).
+
+        Parameters
+        ----------
+        R_nc
+            Camera to NED, at the time of the middle row.
+        position_m
+            Camera less target centre in NED [m]; the third component is negative above the deck. What a
+            detector should find is ``P_c = -R_nc.T @ position_m``.
+        rng
+            Source of noise and of distractors; None gives a picture without either.
+        R_nd
+            Deck to NED (deck axes x, y along its sides, z down into it); level and facing north where not
+            given.
+        rate_c_radps
+            Angular rate of the camera in its own frame [rad/s], for a camera with read-out time.
+
+        Raises ``ValueError`` naming the argument where a matrix is no rotation or the camera is not above the
+        deck.
+        """
+        import cv2
+
+        seen = Conditions() if conditions is None else conditions
+        attitude = check_rotation(R_nc, "R_nc")
+        deck = np.eye(3) if R_nd is None else check_rotation(R_nd, "R_nd")
+        position, rate = np.asarray(position_m, dtype=np.float64), np.asarray(rate_c_radps, dtype=np.float64)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise ValueError(f"position_m: {position_m!r} is not three finite numbers")
+        if rate.shape != (3,) or not np.isfinite(rate).all():
+            raise ValueError(f"rate_c_radps: {rate_c_radps!r} is not three finite numbers")
+        if (deck.T @ position)[2] >= 0.0:
+            raise ValueError("position_m: the camera is not above the deck (Z is negative above it, NED)")
+
+        sea = self._sea_image(attitude, position)
+        if rng is not None and (seen.distractors or seen.boats):
+            _draw_distractors(sea, seen, rng)
+        image = cv2.LUT(sea, _tone(seen))
+        where = None
+        if seen.target:
+            where = self._draw_deck(image, attitude, position, deck, rate, seen)
+        centre, radius_px = self._apparent(attitude, position)
+        _draw_light(image, seen, centre, radius_px)
+        image = _blur(image, seen, where)
+        return self._develop(image, seen, rng)
+
+    def _apparent(self, attitude: Array, position: Array) -> tuple[tuple[float, float], float]:
+        """Return the pixel of the target's centre and its apparent outer radius [px] (far off behind the
+        camera).
+        """
+        centre = -attitude.T @ position
+        u, v = self.camera.project(centre)
+        radius = self.camera.fx * self.target.edges_m[0] / max(float(np.linalg.norm(position)), 1e-6)
+        if not np.isfinite(u):
+            return (-1e6, -1e6), radius
+        return (float(u), float(v)), radius
+
+    def _sea_image(self, attitude: Array, position: Array) -> Image:
+        """Return the sea (and sky) alone, at half the resolution and enlarged: it has no sharp edges."""
+        import cv2
+
+        height = self.scene.freeboard_m - position[2]
+        tile_m = 4.0 * 2.0 ** round(math.log2(max(height, 0.1)))
+        plane = _plane_matrix(attitude, np.array([position[0], position[1], -height]))
+        plane[:2] *= self._sea.shape[0] / tile_m
+        rays = self._coarse_rays
+        down = rays @ plane[2, :2].astype(np.float32) + np.float32(plane[2, 2])
+        sky = down < 0.02
+        points = cv2.perspectiveTransform(rays, plane)
+        if sky.any():
+            points[sky] = 0.0
+        size = np.float32(self._sea.shape[0])
+        points -= size * np.floor(points / size)
+        sea = cv2.remap(self._sea, points, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        if sky.any():
+            sea[sky] = self.scene.sky_rgb[::-1]
+        image: Image = cv2.resize(
+            sea, (self.camera.width, self.camera.height), interpolation=cv2.INTER_LINEAR
+        )
+        return image
+
+    def _region(
+        self, attitude: Array, position: Array, deck: Array, reach_px: float
+    ) -> tuple[slice, slice] | None:
+        """Return the rows and columns that the deck can touch, or None where it is out of the picture."""
+        width, height = self.camera.width, self.camera.height
+        side = np.linspace(-0.5, 0.5, 17) * self.deck_m
+        half = np.full_like(side, 0.5 * self.deck_m)
+        pairs = ((side, half), (side, -half), (half, side), (-half, side))
+        outline = np.concatenate([np.stack(pair) for pair in pairs], axis=1)
+        points = (deck[:, :2] @ outline).T - position
+        seen = points @ attitude
+        limit = 1.3 * float(np.abs(self.camera.ray_table).max())
+        ratio = np.abs(seen[:, :2]) / np.maximum(seen[:, 2:], 1e-9)
+        if (ratio > limit).any():
+            return slice(0, height), slice(0, width)
+        u, v = self.camera.project(seen)
+        rows = slice(max(0, math.floor(v.min() - reach_px)), min(height, math.ceil(v.max() + reach_px) + 1))
+        columns = slice(max(0, math.floor(u.min() - reach_px)), min(width, math.ceil(u.max() + reach_px) + 1))
+        return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
+
+    def _draw_deck(
+        self,
+        image: NDArray[np.float32],
+        attitude: Array,
+        position: Array,
+        deck: Array,
+        rate: Array,
+        seen: Conditions,
+    ) -> tuple[slice, slice] | None:
+        """Draw deck, board and rings into ``image`` and return the rows and columns touched."""
+        import cv2
+
+        rolling = bool(self.camera.readout_s > 0.0 and np.any(rate))
+        swing_rad = float(np.linalg.norm(rate)) * self.camera.readout_s if rolling else 0.0
+        region = self._region(attitude, position, deck, 3.0 + 2.0 * self.camera.fx * swing_rad)
+        if region is None:
+            return None
+        rows, columns = region
+        relative = deck.T @ position
+        if rolling:
+            times = self.camera.row_time_s(np.arange(self.camera.height))
+            matrices = np.stack(
+                [_plane_matrix(deck.T @ attitude @ _rotation(rate * t), relative) for t in times]
+            )
+        else:
+            matrices = _plane_matrix(deck.T @ attitude, relative)[None]
+
+        rays = self.camera.ray_table[rows, columns]
+        points, in_front = _map_rays(rays, matrices[rows] if rolling else matrices)
+        reach = 0.75 * self._pixel_on_deck_m(attitude, position, deck)
+        code = self._classify(points, reach)
+        code[~in_front] = 0
+        palette = cv2.LUT(_palette(self.scene, self.target), _tone(seen))[:, 0]
+        flat = np.zeros((256, 1, 3), dtype=np.float32)
+        flat[: len(palette), 0] = palette
+        picture = image[rows, columns]
+        inside = code & 0x7F
+        filled = cv2.LUT(cv2.merge([inside, inside, inside]), flat)
+
+        edge = np.flatnonzero(code & _EDGE)
+        row, column = np.divmod(edge, code.shape[1])
+        before = picture[row, column]
+        cv2.copyTo(filled, inside, picture)
+        if edge.size:
+            plane = self._plane_map(row + rows.start, column + columns.start, matrices)
+            shares = np.zeros((3, edge.size))
+            shares[0], shares[1] = square(plane, self.deck_m), square(plane, self.target.side_m)
+            for k, radius in enumerate(self.target.edges_m):
+                shares[2] += (1.0 - 2.0 * (k % 2)) * disc(plane, radius)
+            mixed = before * (1.0 - shares[0])[:, None]
+            mixed += np.outer(shares[0] - shares[1], palette[1])
+            mixed += np.outer(shares[1] - shares[2], palette[2]) + np.outer(shares[2], palette[3])
+            picture[row, column] = mixed
+        image[rows, columns] = picture
+        return region
+
+    def _pixel_on_deck_m(self, attitude: Array, position: Array, deck: Array) -> float:
+        """Return the largest length on the deck that one pixel's side covers where the deck is in the
+        picture.
+        """
+        side = np.linspace(-0.5, 0.5, 7) * self.deck_m
+        x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+        seen = (deck[:, :2] @ np.stack([x, y])).T @ attitude - position @ attitude
+        seen = seen[seen[:, 2] > 1e-3]
+        limit = 1.2 * float(np.abs(self.camera.ray_table).max())
+        ray = seen[:, :2] / seen[:, 2:]
+        visible = (np.abs(ray) < limit).all(axis=1)
+        if not visible.any():
+            return float(np.linalg.norm(position)) / self.camera.fx * 4.0
+        seen = seen[visible]
+        length = np.linalg.norm(seen, axis=1)
+        slant = np.abs(seen @ (attitude.T @ deck[:, 2])) / length
+        stretch = float(np.abs(self._slopes[0]).max() * self.camera.fx)
+        longest = float((length / np.maximum(slant, 0.05)).max())
+        return longest / min(self.camera.fx, self.camera.fy) * max(1.1, stretch)
+
+    def _classify(self, points: NDArray[np.float32], reach_m: float) -> NDArray[np.uint8]:
+        """Return what each point of the deck's plane is: 0 sea, 1 deck, 2 board, 3 red; plus _EDGE near an
+        edge.
+        """
+        import cv2
+
+        x, y = cv2.split(points)
+        scale = np.float32((_CODES - 1) / (0.5 * self.deck_m + 2.0 * reach_m))
+        bins = (np.arange(_CODES) + 0.5) / scale
+        reach_m += 1.0 / float(scale)
+        straight = np.where(bins < 0.5 * self.deck_m, 1, 0)
+        straight[bins < 0.5 * self.target.side_m] = 2
+        for side in (self.deck_m, self.target.side_m):
+            straight[np.abs(bins - 0.5 * side) < reach_m] |= _EDGE
+        round_ = self.target.is_red(bins).astype(np.int64)
+        for radius in self.target.edges_m:
+            round_[np.abs(bins - radius) < reach_m] |= _EDGE
+        largest = np.float32(_CODES - 1)
+        square_bin = np.minimum(cv2.max(cv2.absdiff(x, 0.0), cv2.absdiff(y, 0.0)) * scale, largest).astype(
+            np.uint16
+        )
+        ring_bin = np.minimum(cv2.magnitude(x, y) * scale, largest).astype(np.uint16)
+        code: NDArray[np.uint8] = np.take(straight.astype(np.uint8), square_bin)
+        code |= np.take(round_.astype(np.uint8), ring_bin)
+        return code
+
+    def _plane_map(self, row: NDArray[np.intp], column: NDArray[np.intp], matrices: Array) -> PlaneMap:
+        """Return the exact map from some pixels to the deck's plane."""
+        along_u, along_v = (slope[row, column].astype(np.float64).T for slope in self._slopes)
+        ray = self.camera.ray_table[row, column].astype(np.float64).T
+        if len(matrices) == 1:
+            m = matrices[0]
+            return PlaneMap(m[:, :2] @ ray + m[:, 2:], m[:, :2] @ along_u, m[:, :2] @ along_v)
+        m = matrices[row]
+        turned = np.gradient(matrices, axis=0)[row]
+        ones = np.concatenate([ray, np.ones((1, ray.shape[1]))])
+        value = np.einsum("nij,jn->in", m, ones)
+        by_row = np.einsum("nij,jn->in", m[:, :, :2], along_v) + np.einsum("nij,jn->in", turned, ones)
+        return PlaneMap(value, np.einsum("nij,jn->in", m[:, :, :2], along_u), by_row)
+
+    def _develop(
+        self, image: NDArray[np.float32], seen: Conditions, rng: np.random.Generator | None
+    ) -> Image:
+        """Add noise, apply gamma, clip, compress."""
+        import cv2
+
+        if rng is not None and (seen.read_noise > 0.0 or seen.shot_noise > 0.0):
+            start = int(rng.integers(0, self._bank.size - image.size + 1))
+            noise = self._bank[start : start + image.size].reshape(image.shape)
+            sign = float(rng.integers(0, 2) * 2 - 1)
+            if seen.shot_noise > 0.0:
+                variance = cv2.max(image, 0.0) * np.float32(seen.shot_noise) + np.float32(seen.read_noise**2)
+                image = image + cv2.sqrt(variance) * noise * np.float32(sign)
+            else:
+                image = cv2.scaleAdd(noise, sign * seen.read_noise, image)
+        if seen.gamma == 1.0:
+            picture: Image = cv2.add(image, 0.0, dtype=cv2.CV_8U)
+        else:
+            levels = np.arange(4096) / 4095.0
+            encoded = np.rint(255.0 * levels ** (1.0 / seen.gamma)).astype(np.uint8)
+            picture = encoded[np.clip(image * np.float32(4095.0 / 255.0) + 0.5, 0, 4095).astype(np.uint16)]
+        if seen.jpeg_quality is not None:
+            done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(seen.jpeg_quality)])
+            if not done:
+                raise RuntimeError("the picture could not be compressed as JPEG")
+            picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        return picture
+
+
+def _plane_matrix(attitude: Array, position: Array) -> Array:
+    """Return M such that a ray d meets the plane z = 0 at (n0 / n2, n1 / n2), n = M d.
+
+    ``attitude`` takes rays to the plane's axes (z down), ``position`` is the camera's in them (z negative
+    above).
+    """
+    x, y, z = position
+    lift = np.array([[-z, 0.0, x], [0.0, -z, y], [0.0, 0.0, 1.0]])
+    matrix: Array = lift @ attitude
+    return matrix
+
+
+def _map_rays(rays: NDArray[np.float32], matrices: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Map rays (rows, columns, 2) to the plane, by one matrix or by one for each row; also: which meet it."""
+    import cv2
+
+    if len(matrices) == 1:
+        m = matrices[0].astype(np.float32)
+        down = rays[..., 0] * m[2, 0] + (rays[..., 1] * m[2, 1] + m[2, 2])
+        return cv2.perspectiveTransform(np.ascontiguousarray(rays), matrices[0]), down > 1e-6
+    m = matrices.astype(np.float32)[:, None]
+    x, y = rays[..., 0], rays[..., 1]
+    n = [m[..., i, 0] * x + m[..., i, 1] * y + m[..., i, 2] for i in range(3)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([n[0] / n[2], n[1] / n[2]], axis=-1), n[2] > 1e-6
+
+
+def _rotation(vector: Array) -> Array:
+    """Return the rotation matrix of a rotation vector [rad]."""
+    import cv2
+
+    matrix: Array = cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0]
+    return matrix
+
+
+def _palette(scene: Scene, target: RingTarget) -> Image:
+    """Return the colours of codes 0..3 as BGR, shape (4, 1, 3)."""
+    colours = (scene.sea_rgb, scene.deck_rgb, target.white_rgb, target.red_rgb)
+    return np.array([colour[::-1] for colour in colours], dtype=np.uint8)[:, None]
+
+
+def _tone(seen: Conditions) -> NDArray[np.float32]:
+    """Return the table from colours 0..255 to light (255: full scale) under this light and cast, (256, 1,
+    3).
+    """
+    level = 255.0 * (np.arange(256) / 255.0) ** seen.gamma
+    factors = seen.light * np.array(seen.cast_rgb[::-1])
+    return (level[:, None, None] * factors).astype(np.float32)
+
+
+def _sea_texture(scene: Scene, generator: np.random.Generator, size: int = 1024) -> Image:
+    """Return a tile of sea, BGR, that continues across its borders: waves of all lengths, some glints."""
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :]) * size
+    spectrum = np.fft.rfft2(generator.standard_normal((size, size))) / np.maximum(frequency, 4.0) ** 1.2
+    spectrum[frequency > size / 6.0] = 0.0
+    waves = np.fft.irfft2(spectrum, s=(size, size))
+    waves /= waves.std()
+    shade = np.array(scene.sea_rgb[::-1]) * (1.0 + 0.13 * scene.sea_contrast * waves[..., None])
+    glint = np.clip(waves - 2.3, 0.0, None)[..., None] * 90.0 * scene.sea_contrast
+    return np.clip(shade + glint, 0, 255).astype(np.uint8)
+
+
+def _draw_distractors(sea: Image, seen: Conditions, rng: np.random.Generator) -> None:
+    """Draw red discs, ellipses, rings and boats at random places, in place."""
+    import cv2
+
+    height, width = sea.shape[:2]
+    for _ in range(seen.distractors):
+        kind = int(rng.integers(0, 3))
+        centre = (int(rng.integers(0, 16 * width)), int(rng.integers(0, 16 * height)))
+        size = int(16 * rng.uniform(4.0, 0.12 * width))
+        other = size if kind != 1 else int(size * rng.uniform(0.3, 0.9))
+        red = int(rng.integers(120, 256))
+        colour = (int(red * rng.uniform(0.05, 0.4)), int(red * rng.uniform(0.05, 0.4)), red)
+        thickness = -1 if kind != 2 else max(2, int(size / 16 * rng.uniform(0.1, 0.5)))
+        angle = float(rng.uniform(0.0, 180.0))
+        outline = cv2.ellipse2Poly(
+            (centre[0] >> 4, centre[1] >> 4), (size >> 4, other >> 4), int(angle), 0, 360, 3
+        )
+        if thickness < 0:
+            cv2.fillPoly(sea, [outline], colour, cv2.LINE_AA)
+        else:
+            cv2.polylines(sea, [outline], True, colour, thickness, cv2.LINE_AA)
+    for _ in range(seen.boats):
+        length = rng.uniform(0.08, 0.35) * width
+        hull = np.array([[-0.5, -0.14], [0.3, -0.14], [0.5, 0.0], [0.3, 0.14], [-0.5, 0.14]]) * length
+        stripe = np.array([[-0.45, -0.05], [0.2, -0.05], [0.2, 0.05], [-0.45, 0.05]]) * length
+        angle = rng.uniform(0.0, 2.0 * math.pi)
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        place = rng.uniform(0.0, 1.0, 2) * (width, height)
+        for shape, colour in ((hull, (225, 228, 230)), (stripe, (30, 25, 190))):
+            outline = np.rint((shape @ turn.T + place) * 16).astype(np.int32)
+            cv2.fillPoly(sea, [outline], colour, cv2.LINE_AA, 4)
+
+
+def _draw_light(
+    image: NDArray[np.float32], seen: Conditions, centre: tuple[float, float], radius_px: float
+) -> None:
+    """Apply shadow, glare and bar, in place. Their edges are anti-aliased over one pixel."""
+    height, width = image.shape[:2]
+    u = (np.arange(width) - centre[0]).astype(np.float32)[None, :]
+    v = (np.arange(height) - centre[1]).astype(np.float32)[:, None]
+    if seen.shadow != 1.0:
+        c, s = math.cos(seen.shadow_angle_rad), math.sin(seen.shadow_angle_rad)
+        depth = u * np.float32(c) + v * np.float32(s) - np.float32(seen.shadow_offset * radius_px)
+        image *= 1.0 + np.float32(seen.shadow - 1.0) * np.clip(depth + 0.5, 0.0, 1.0)[..., None]
+    if seen.glare > 0.0:
+        du, dv = u - seen.glare_offset[0] * radius_px, v - seen.glare_offset[1] * radius_px
+        sigma = max(seen.glare_radius * radius_px, 0.5)
+        blob = np.exp(-(du**2) / (2.0 * sigma**2)) * np.exp(-(dv**2) / (2.0 * sigma**2))
+        image += (255.0 * seen.glare * blob).astype(np.float32)[..., None]
+    if seen.bar_px > 0.0:
+        c, s = math.cos(seen.bar_angle_rad), math.sin(seen.bar_angle_rad)
+        off = np.abs(v * np.float32(c) - u * np.float32(s) - np.float32(seen.bar_offset * radius_px))
+        share = np.clip(0.5 * seen.bar_px - off + 0.5, 0.0, 1.0)[..., None].astype(np.float32)
+        colour = _tone(seen)[list(seen.bar_rgb[::-1]), 0, [0, 1, 2]]
+        image += share * (colour - image)
+
+
+def _blur(
+    image: NDArray[np.float32], seen: Conditions, where: tuple[slice, slice] | None
+) -> NDArray[np.float32]:
+    """Apply the lens's and the motion's blur; a lens blur below a pixel only where there are sharp edges."""
+    import cv2
+
+    if seen.defocus_px > 0.0:
+        width = 2 * math.ceil(3.5 * seen.defocus_px) + 1
+        plain = seen.defocus_px <= 1.0 and seen.bar_px == 0.0 and seen.shadow == 1.0 and not seen.distractors
+        if plain and where is not None:
+            part = image[where]
+            image[where] = cv2.GaussianBlur(
+                part, (width, width), seen.defocus_px, borderType=cv2.BORDER_REPLICATE
+            )
+        elif not plain:
+            image = cv2.GaussianBlur(image, (width, width), seen.defocus_px, borderType=cv2.BORDER_REPLICATE)
+    if seen.motion_px > 0.0:
+        image = cv2.filter2D(
+            image, -1, _motion_kernel(seen.motion_px, seen.motion_angle_rad), borderType=cv2.BORDER_REPLICATE
+        )
+    return image
+
+
+def _motion_kernel(length_px: float, angle_rad: float) -> NDArray[np.float32]:
+    """Return the picture of a point that moves evenly along a line, by bilinear splatting; its sum is 1."""
+    half = math.ceil(length_px / 2.0) + 1
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.float32)
+    for along in (np.arange(400) + 0.5) / 400.0 - 0.5:
+        u, v = half + along * length_px * math.cos(angle_rad), half + along * length_px * math.sin(angle_rad)
+        i, j = math.floor(v), math.floor(u)
+        for di, wi in ((0, 1.0 - v + i), (1, v - i)):
+            for dj, wj in ((0, 1.0 - u + j), (1, u - j)):
+                kernel[i + di, j + dj] += wi * wj
+    return kernel / kernel.sum()
