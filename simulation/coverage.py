@@ -7,6 +7,8 @@ sub-square, which differs from the value in the middle by the curvature over 24,
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,15 +42,37 @@ class PlaneMap:
     def __init__(self, value: Array, along_u: Array, along_v: Array) -> None:
         self.value, self.along_u, self.along_v = value, along_u, along_v
 
+    @cached_property
+    def centre(self) -> tuple[Array, Array, Array]:
+        """The map in the pixels' middles: what ``at(0, 0)`` returns."""
+        return self.at(0.0, 0.0)
+
+    @cached_property
+    def step(self) -> Array:
+        """Length on the plane that is no less than that of one pixel's side, in any direction; shape
+        (pixels,).
+        """
+        _, along_u, along_v = self.centre
+        length2: Array = along_u[0] ** 2 + along_u[1] ** 2 + along_v[0] ** 2 + along_v[1] ** 2
+        return np.sqrt(length2)
+
+    @cached_property
+    def radius(self) -> Array:
+        """Distance of the pixels' middles from the plane's origin; shape (pixels,)."""
+        point = self.centre[0]
+        length2: Array = point[0] * point[0] + point[1] * point[1]
+        return np.sqrt(length2)
+
     def take(self, index: NDArray[np.intp]) -> PlaneMap:
         """Return the map at some of the pixels."""
-        return PlaneMap(self.value[:, index], self.along_u[:, index], self.along_v[:, index])
+        along = (a if a.shape[1] == 1 else a[:, index] for a in (self.along_u, self.along_v))
+        return PlaneMap(self.value[:, index], *along)
 
     def at(self, du: float, dv: float) -> tuple[Array, Array, Array]:
         """Return the plane's coordinates, shape (2, pixels), and their derivatives along u and v, at an
         offset.
         """
-        n = self.value + du * self.along_u + dv * self.along_v
+        n = self.value if du == dv == 0.0 else self.value + du * self.along_u + dv * self.along_v
         inverse = 1.0 / n[2]
         point = n[:2] * inverse
         along_u = (self.along_u[:2] - point * self.along_u[2]) * inverse
@@ -60,13 +84,10 @@ def disc(plane: PlaneMap, radius: float) -> Array:
     """Return the share of each pixel inside the disc of this radius around the plane's origin; shape
     (pixels,).
     """
-    point, along_u, along_v = plane.at(0.0, 0.0)
-    rho = np.maximum(np.hypot(point[0], point[1]), 1e-9 * radius)
-    step = np.sqrt((along_u**2 + along_v**2).sum(axis=0))  # no less than a pixel's length
-    share = (rho < radius).astype(np.float64)
-    near = np.flatnonzero(np.abs(rho - radius) < 0.75 * step)
+    share: Array = (plane.radius < radius).astype(np.float64)
+    near = np.flatnonzero(np.abs(plane.radius - radius) < 0.75 * plane.step)
     if near.size:
-        radius_px = radius / step[near]
+        radius_px = radius / plane.step[near]
         cuts = np.select([radius_px > 25.0, radius_px > 5.0, radius_px > 1.5], [1, 2, 4], 8)
         for n in np.unique(cuts):
             some = near[cuts == n]
@@ -82,12 +103,12 @@ def _disc_cut(plane: PlaneMap, radius: float, cuts: int) -> Array:
         for j in range(cuts):
             point, along_u, along_v = plane.at((i + 0.5) * side - 0.5, (j + 0.5) * side - 0.5)
             rho = np.maximum(np.hypot(point[0], point[1]), 1e-9 * radius)
-            slope_u = (point * along_u).sum(axis=0) / rho
-            slope_v = (point * along_v).sum(axis=0) / rho
-            slope2 = slope_u**2 + slope_v**2
-            bend = ((along_u**2 + along_v**2).sum(axis=0) - slope2) / rho
-            slope = np.sqrt(np.maximum(slope2, 1e-24))
-            distance = (rho - radius + side * side / 24.0 * bend) / (slope * side)
+            slope_u = (point[0] * along_u[0] + point[1] * along_u[1]) / rho
+            slope_v = (point[0] * along_v[0] + point[1] * along_v[1]) / rho
+            slope2 = np.maximum(slope_u**2 + slope_v**2, 1e-24)
+            stretch = along_u[0] ** 2 + along_u[1] ** 2 + along_v[0] ** 2 + along_v[1] ** 2
+            slope = np.sqrt(slope2)
+            distance = (rho - radius + side * side / 24.0 * (stretch - slope2) / rho) / (slope * side)
             total += half_plane(distance, slope_u / slope, slope_v / slope)
     return total * (side * side)
 
@@ -98,10 +119,14 @@ def square(plane: PlaneMap, side: float) -> Array:
 
     Exact but for the four corners, where the shares of the two strips are multiplied.
     """
-    point, along_u, along_v = plane.at(0.0, 0.0)
-    share = np.ones(point.shape[1])
-    for axis in (0, 1):
-        slope = np.maximum(np.hypot(along_u[axis], along_v[axis]), 1e-24)
-        distance = (np.abs(point[axis]) - 0.5 * side) / slope
-        share *= half_plane(distance, along_u[axis] / slope, along_v[axis] / slope)
+    away = np.maximum(np.abs(plane.centre[0][0]), np.abs(plane.centre[0][1]))
+    share: Array = (away < 0.5 * side).astype(np.float64)
+    near = np.flatnonzero(np.abs(away - 0.5 * side) < 0.75 * plane.step)
+    if near.size:
+        share[near] = 1.0
+        for axis in (0, 1):
+            point, along_u, along_v = (part[axis, near] for part in plane.centre)
+            slope = np.maximum(np.hypot(along_u, along_v), 1e-24)
+            distance = (np.abs(point) - 0.5 * side) / slope
+            share[near] *= half_plane(distance, along_u / slope, along_v / slope)
     return share

@@ -364,17 +364,24 @@ class Renderer:
 
     def _plane_map(self, row: NDArray[np.intp], column: NDArray[np.intp], matrices: Array) -> PlaneMap:
         """Return the exact map from some pixels to the deck's plane."""
-        along_u, along_v = (slope[row, column].astype(np.float64).T for slope in self._slopes)
-        ray = self.camera.ray_table[row, column].astype(np.float64).T
+        if self.camera.distortion:
+            ray = self.camera.ray_table[row, column].astype(np.float64).T
+            along_u, along_v = (slope[row, column].astype(np.float64).T for slope in self._slopes)
+        else:
+            ray = np.stack(self.camera.rays(column, row))
+            along_u, along_v = (
+                np.array([[1.0 / self.camera.fx], [0.0]]),
+                np.array([[0.0], [1.0 / self.camera.fy]]),
+            )
         if len(matrices) == 1:
             m = matrices[0]
             return PlaneMap(m[:, :2] @ ray + m[:, 2:], m[:, :2] @ along_u, m[:, :2] @ along_v)
-        m = matrices[row]
-        turned = np.gradient(matrices, axis=0)[row]
-        ones = np.concatenate([ray, np.ones((1, ray.shape[1]))])
+        m, turned = matrices[row], np.gradient(matrices, axis=0)[row]
+        ones = np.concatenate([ray, np.ones((1, row.size))])
         value = np.einsum("nij,jn->in", m, ones)
-        by_row = np.einsum("nij,jn->in", m[:, :, :2], along_v) + np.einsum("nij,jn->in", turned, ones)
-        return PlaneMap(value, np.einsum("nij,jn->in", m[:, :, :2], along_u), by_row)
+        by_column = np.einsum("nij,jn->in", m[:, :, :2], np.broadcast_to(along_u, ray.shape))
+        by_row = np.einsum("nij,jn->in", m[:, :, :2], np.broadcast_to(along_v, ray.shape))
+        return PlaneMap(value, by_column, by_row + np.einsum("nij,jn->in", turned, ones))
 
     def _develop(
         self, image: NDArray[np.float32], seen: Conditions, rng: np.random.Generator | None
@@ -401,7 +408,7 @@ class Renderer:
             done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(seen.jpeg_quality)])
             if not done:
                 raise RuntimeError("the picture could not be compressed as JPEG")
-            picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
+            return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
         return picture
 
 
@@ -557,4 +564,4 @@ def _motion_kernel(length_px: float, angle_rad: float) -> NDArray[np.float32]:
         for di, wi in ((0, 1.0 - v + i), (1, v - i)):
             for dj, wj in ((0, 1.0 - u + j), (1, u - j)):
                 kernel[i + di, j + dj] += wi * wj
-    return kernel / kernel.sum()
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)

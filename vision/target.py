@@ -7,6 +7,7 @@ here.
 
 from __future__ import annotations
 
+import itertools
 import math
 import tomllib
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Colour = tuple[int, int, int]
 
@@ -70,7 +71,7 @@ class RingTarget:
             raise ValueError(f"edges_m: {len(edges)} radii; a ring has two edges")
         if not all(math.isfinite(r) and r > 0.0 for r in edges):
             raise ValueError(f"edges_m: {edges} are not all positive and finite")
-        if any(inner >= outer for outer, inner in zip(edges, edges[1:], strict=False)):
+        if any(inner >= outer for outer, inner in itertools.pairwise(edges)):
             raise ValueError(f"edges_m: {edges} do not descend; list the edges from the outside in")
         object.__setattr__(self, "edges_m", edges)
         board = 2.6 * edges[0] if self.board_m is None else float(self.board_m)
@@ -128,16 +129,17 @@ class RingTarget:
         steps = -np.diff(self.edges_m)
         return float(steps.mean()) if np.ptp(steps) <= 1e-6 * steps.mean() else None
 
-    def is_red(self, radius_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_red(self, radius_m: ArrayLike) -> NDArray[np.bool_]:
         """Return where points at these distances from the centre [m] are red."""
-        inside: NDArray[np.intp] = np.searchsorted(-np.asarray(self.edges_m), -np.asarray(radius_m))
-        return inside % 2 == 1
+        edges_around = np.searchsorted(-np.asarray(self.edges_m), -np.asarray(radius_m))
+        return np.asarray(edges_around % 2 == 1)
 
     def to_toml(self) -> str:
         """Return the text of a ``target.toml``. Law: ``RingTarget.from_toml(t.to_toml()) == t``."""
         return (
-            "# Concentric red rings on a white board: edge radii [m] from the outside in, red between the 1st and\n"
-            "# 2nd, the 3rd and 4th, ... MEASURE the print and correct the radii: 1 % there is 1 % of distance.\n"
+            "# Concentric red rings on white. edges_m: radii of the edges from the outside in, red from\n"
+            "# the 1st to the 2nd, the 3rd to the 4th, ... Measure the print and correct them: an error of 1 % here\n"
+            "# is an error of 1 % in every distance.\n"
             f"name = {msgspec.json.encode(self.name).decode()}\n"
             f"edges_m = [{', '.join(repr(r) for r in self.edges_m)}]\n"
             f"board_m = {self.side_m!r}\n"
