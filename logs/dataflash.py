@@ -141,7 +141,7 @@ def _walk(
         return at, which.astype(np.uint16), layouts
     ends = at + np.array([layout.length for layout in layouts], dtype=np.int64)[which]
     keep = _chain(at, ends, len(data))
-    _tell_losses(data, at[keep], ends[keep], log)
+    _tell_losses(data, at[keep], ends[keep], set(definitions), log)
     own = at[keep & (data[at + 2] == _FMT_TYPE)].tolist()
     damaged = sum(_parse_format(data[k : k + _FMT_LENGTH].tobytes()) is None for k in own)
     if damaged:
@@ -191,7 +191,11 @@ def _chain(at: NDArray[np.int64], ends: NDArray[np.int64], size: int) -> NDArray
 
 
 def _tell_losses(
-    data: NDArray[np.uint8], at: NDArray[np.int64], ends: NDArray[np.int64], log: DataflashLog
+    data: NDArray[np.uint8],
+    at: NDArray[np.int64],
+    ends: NDArray[np.int64],
+    known: set[int],
+    log: DataflashLog,
 ) -> None:
     """Add to the problems what lies between the messages."""
     starts = np.concatenate([[0], ends])
@@ -202,18 +206,18 @@ def _tell_losses(
     unknown: Counter[int] = Counter()
     for g in gaps[:10000].tolist():
         head = data[starts[g] : starts[g] + 3].tobytes()
-        if head.startswith(_HEADER) and len(head) == 3:
+        if head.startswith(_HEADER) and len(head) == 3 and head[2] not in known:
             unknown[head[2]] += 1
     lost = int((stops[gaps] - starts[gaps]).sum())
     if len(gaps) == 1 and gaps[0] == len(at):
-        log.problems.append(f"the last {lost} bytes are not a whole message (the log was cut off)")
+        log.problems.append(f"the log ends within a message, whose {lost} bytes are lost")
     else:
         log.problems.append(
             f"{lost} bytes in {len(gaps)} places are not readable messages and were passed over"
         )
     if unknown:
         kinds = ", ".join(str(k) for k, _ in unknown.most_common(8))
-        log.problems.append(f"message types without a format definition, or cut short: {kinds}")
+        log.problems.append(f"message types without a format definition (FMT) were passed over: {kinds}")
 
 
 def _gather(data: NDArray[np.uint8], offsets: NDArray[np.int64], layout: Format) -> NDArray[np.void]:
