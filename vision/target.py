@@ -137,9 +137,9 @@ class RingTarget:
     def to_toml(self) -> str:
         """Return the text of a ``target.toml``. Law: ``RingTarget.from_toml(t.to_toml()) == t``."""
         return (
-            "# Concentric red rings on white. edges_m: radii of the edges from the outside in, red from the\n"
-            "# 1st to the 2nd, the 3rd to the 4th, ... Measure the print and correct them: 1 % here is 1 % of\n"
-            "# every distance.\n"
+            "# Concentric red rings on white. edges_m: radii of the edges from the outside in; red lies from\n"
+            "# the 1st to the 2nd, the 3rd to the 4th, ... Measure the print and correct them: an error of\n"
+            "# 1 % here is an error of 1 % in every distance.\n"
             f"name = {msgspec.json.encode(self.name).decode()}\n"
             f"edges_m = [{', '.join(repr(r) for r in self.edges_m)}]\n"
             f"board_m = {self.side_m!r}\n"
