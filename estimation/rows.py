@@ -21,7 +21,8 @@ class Rows:
     """Events as columns of equal length n.
 
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
-    the filter had already passed that time. The engines write ``outcome``, ``reset`` (1 where a lock-out was
+    the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
+    the inertial clock was past the content when it arrived. The engines write ``outcome``, ``reset`` (1 where a lock-out was
     resolved) and ``result`` (n, 8): NIS, dimension, innovation (3), its predicted sigma (3).
     """
 
@@ -30,6 +31,9 @@ class Rows:
     sensor: Int
     id: Int
     late: Int
+    stamp_ns: Int
+    arrival_ns: Int
+    age_ns: Int
     value: Array
     own: Array
     outcome: Int
@@ -39,7 +43,7 @@ class Rows:
     @classmethod
     def empty(cls, n: int) -> Rows:
         """Return n rows, not yet tried."""
-        integers = [np.zeros(n, dtype=np.int64) for _ in range(5)]
+        integers = [np.zeros(n, dtype=np.int64) for _ in range(8)]
         return cls(
             *integers,
             np.zeros((n, 6)),
@@ -53,7 +57,7 @@ class Rows:
     def columns(self) -> tuple[NDArray[np.generic], ...]:
         """All columns, in the order of the constructor."""
         return (
-            self.t_ns, self.kind, self.sensor, self.id, self.late,
+            self.t_ns, self.kind, self.sensor, self.id, self.late, self.stamp_ns, self.arrival_ns, self.age_ns,
             self.value, self.own, self.outcome, self.reset, self.result,
         )  # fmt: skip
 

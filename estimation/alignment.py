@@ -1,0 +1,365 @@
+"""Alignment: from raw sensors to the first state, at rest or in flight.
+
+Events come in the order of their content and are never looked at twice. The horizon is found from the specific
+force (at rest) or from the specific force and the change of the GPS velocity (in flight: f = dv/dt - g), heading from
+the magnetometer, from the autopilot's attitude where that is allowed, or else from the horizontal acceleration that
+GPS and accelerometers both see. Nothing is given out before all of it is known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from estimation.config import Config
+from estimation.events import Kind
+from estimation.frames import (
+    Array,
+    euler_to_quat,
+    geodetic_to_ned,
+    normal_gravity,
+    quat_exp,
+    quat_multiply,
+    quat_normalise,
+    quat_to_euler,
+    quat_to_matrix,
+    wrap_pi,
+)
+from estimation.models import pressure_altitude
+from estimation.parameters import Site
+from estimation.rows import FilterState, Rows
+from estimation.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    BARO_BIAS,
+    BB0,
+    BG0,
+    GPS_BIAS,
+    GYRO_BIAS,
+    P0,
+    POSITION,
+    Q0,
+    V0,
+    VELOCITY,
+    Layout,
+    nominal_zero,
+)
+
+REST_GYRO_RADPS = 0.05
+"""Largest standard deviation of the angular velocity at rest [rad/s]."""
+REST_ACCEL_MPS2 = 0.5
+"""Largest standard deviation of the specific force at rest [m/s^2]."""
+REST_SPEED_MPS = 0.5
+"""Largest GPS speed at rest [m/s]."""
+LEVEL_TIME_S = 10.0
+"""Time constant with which the running horizon follows the specific force."""
+HEADING_MEMORY_S = 60.0
+"""Memory of the heading from accelerations."""
+FRESH_NS = 1_000_000_000
+"""Oldest GPS, magnetometer or attitude that a start may use."""
+
+
+@dataclass(slots=True)
+class Aligned:
+    """A first state: ready to run, with a sentence on how it was found."""
+
+    site: Site
+    state: FilterState
+    note: str
+
+
+@dataclass(slots=True)
+class Aligner:
+    """Collects what a start needs. ``site`` is kept from an earlier start of the same flight, if there was one."""
+
+    config: Config
+    layout: Layout
+    sensors: int
+    declination_rad: float | None = None
+    """Declination where it is known beforehand; None: from the World Magnetic Model."""
+    utc_s: float = 0.0
+    """Date for the World Magnetic Model, seconds since 1970."""
+    site: Site | None = None
+    gyro_bias: Array | None = None
+    _imu: list[tuple[int, Array]] = field(default_factory=list)
+    _velocities: list[tuple[int, Array, Array]] = field(default_factory=list)
+    _fix: tuple[int, Array, Array] | None = None
+    _mag: tuple[int, Array] | None = None
+    _attitude: tuple[int, Array] | None = None
+    _pressure: tuple[int, float] | None = None
+    _level: Array | None = None
+    _impulse: Array = field(default_factory=lambda: np.zeros(3))
+    _previous_velocity: tuple[int, Array] | None = None
+    _heading_sums: Array = field(default_factory=lambda: np.zeros(4))
+
+    def consume(self, rows: Rows, start: int, stop: int) -> tuple[int, Aligned] | None:
+        """Take rows in order; return the index after the inertial sample at which the filter can start, and the state.
+
+        None while something is missing (``missing`` says what).
+        """
+        for i in range(start, stop):
+            t, kind, value = int(rows.t_ns[i]), int(rows.kind[i]), rows.value[i].copy()
+            if kind == Kind.IMU:
+                self._take_imu(t, value)
+                aligned = self._try(t)
+                if aligned is not None:
+                    return i + 1, aligned
+            elif kind == Kind.GPS_POSITION and self._good(value, rows.own[i]):
+                self._fix = (t, value[:3], rows.own[i].copy())
+            elif kind == Kind.GPS_VELOCITY and value[3] >= 1.0:
+                self._take_velocity(t, value[:3], rows.own[i].copy())
+            elif kind == Kind.MAGNETOMETER and self.config.magnetometer.use:
+                self._mag = (t, value[:3])
+            elif kind == Kind.ATTITUDE and self.config.attitude.use != "off":
+                self._attitude = (t, quat_normalise(value[:4]))
+            elif kind == Kind.BAROMETER and value[0] > 0.0:
+                self._pressure = (t, float(value[0]))
+        return None
+
+    @property
+    def missing(self) -> str:
+        """What the start still waits for, in words."""
+        if len(self._imu) < 2:
+            return "inertial samples"
+        if self._fix is None or not self._velocities:
+            return "a good GPS position and velocity"
+        if self._mag is None and self._attitude is None:
+            return "a heading (magnetometer, autopilot attitude, or horizontal acceleration seen by GPS)"
+        return "recent readings of all sensors"
+
+    def _good(self, value: Array, own: Array) -> bool:
+        limit = self.config.gps.max_accuracy_m**2
+        return bool(value[3] >= 1.0 and not own[0] > limit and not own[3] > limit)
+
+    def _take_imu(self, t: int, value: Array) -> None:
+        if self._imu and t - self._imu[-1][0] > int(self.config.imu.gap_s * 1e9):
+            self._imu.clear()
+            self._level = None
+            self._heading_sums[:] = 0.0
+            self._previous_velocity = None
+        span = int(self.config.initialisation.rest_s * 1e9)
+        if self._imu:
+            self._run_level(t, value)
+        self._imu.append((t, value))
+        while self._imu[-1][0] - self._imu[1 if len(self._imu) > 1 else 0][0] >= span:
+            self._imu.pop(0)
+
+    def _window(self) -> Array:
+        return np.array([v for _, v in self._imu])
+
+    def _run_level(self, t: int, value: Array) -> None:
+        """Carry a horizon with unknown heading along, for the heading from accelerations."""
+        t0, previous = self._imu[-1]
+        dt = (t - t0) * 1e-9
+        if self._level is None:
+            if self._imu[-1][0] - self._imu[0][0] < int(0.9e9 * self.config.initialisation.rest_s):
+                return
+            window = self._window()
+            force = window[:, 3:].mean(axis=0)
+            self._level = _attitude_from(force, np.array([0.0, 0.0, -1.0]), 0.0)
+            if self.gyro_bias is None and self._still(window):
+                self.gyro_bias = window[:, :3].mean(axis=0)
+        w = 0.5 * (previous[:3] + value[:3]) - (self.gyro_bias if self.gyro_bias is not None else 0.0)
+        f = 0.5 * (previous[3:] + value[3:])
+        force_n = quat_to_matrix(self._level) @ f
+        # A slow pull of the horizon towards the mean specific force.
+        pull = np.cross(force_n, [0.0, 0.0, -1.0]) / max(1.0, float(np.linalg.norm(force_n))) * (dt / LEVEL_TIME_S)
+        self._level = quat_normalise(quat_multiply(quat_exp(pull), quat_multiply(self._level, quat_exp(w * dt))))
+        self._impulse = self._impulse + (force_n + [0.0, 0.0, 9.81]) * dt
+
+    def _take_velocity(self, t: int, velocity: Array, own: Array) -> None:
+        self._velocities.append((t, velocity, own))
+        if len(self._velocities) > 20:
+            self._velocities.pop(0)
+        if self._level is not None:
+            if self._previous_velocity is not None:
+                t0, v0 = self._previous_velocity
+                d, u = velocity[:2] - v0[:2], self._impulse[:2]
+                forget = math.exp(-(t - t0) * 1e-9 / HEADING_MEMORY_S)
+                self._heading_sums *= forget
+                self._heading_sums += [
+                    u[0] * d[0] + u[1] * d[1], u[0] * d[1] - u[1] * d[0], float(u @ u), float(d @ d),
+                ]  # fmt: skip
+            self._previous_velocity = (t, velocity)
+            self._impulse = np.zeros(3)
+
+    def _heading_from_motion(self) -> tuple[float, float] | None:
+        """Return the angle from the running horizon's heading to true north and its 1-sigma [rad]."""
+        cosine, sine, uu, dd = self._heading_sums
+        if uu < 0.5:
+            return None
+        angle = math.atan2(sine, cosine)
+        residual = max(0.0, dd - math.hypot(sine, cosine) ** 2 / uu)
+        noise = max(2.0 * self.config.gps.velocity_sigma_mps**2, residual / 10.0)
+        return angle, math.sqrt(noise / uu)
+
+    def _still(self, window: Array) -> bool:
+        quiet = bool(
+            np.all(window[:, :3].std(axis=0) < REST_GYRO_RADPS)
+            and np.all(window[:, 3:].std(axis=0) < REST_ACCEL_MPS2)
+            and np.linalg.norm(window[:, :3].mean(axis=0)) < 0.1
+            and abs(np.linalg.norm(window[:, 3:].mean(axis=0)) - 9.8) < 0.5
+        )
+        slow = not self._velocities or float(np.linalg.norm(self._velocities[-1][1][:2])) < REST_SPEED_MPS
+        return quiet and slow
+
+    def _try(self, t: int) -> Aligned | None:
+        c = self.config
+        if self._imu[-1][0] - self._imu[0][0] < int(0.9e9 * c.initialisation.rest_s):
+            return None
+        if self._fix is None or not self._velocities:
+            return None
+        if t - self._fix[0] > FRESH_NS or t - self._velocities[-1][0] > FRESH_NS:
+            return None
+        if c.barometer.use and self._pressure is None and len(self._velocities) < 20:
+            return None  # give a slow barometer a few seconds to speak
+        window = self._window()
+        rest = self._still(window)
+        velocity = self._velocities[-1][1]
+        site = self.site or self._site()
+        attitude = self._first_attitude(t, window, rest, site)
+        if attitude is None:
+            return None
+        q, yaw_sigma, how = attitude
+        return Aligned(site, self._state(t, q, yaw_sigma, rest, velocity, site), how)
+
+    def _site(self) -> Site:
+        assert self._fix is not None
+        o = self.config.origin
+        latitude, longitude, altitude = (float(v) for v in self._fix[1])
+        if o.latitude_deg is not None and o.longitude_deg is not None and o.altitude_m is not None:
+            latitude, longitude, altitude = math.radians(o.latitude_deg), math.radians(o.longitude_deg), o.altitude_m
+        declination = self.declination_rad
+        if declination is None:
+            declination = world_magnetic_declination(latitude, longitude, altitude, self.utc_s)
+        return Site((latitude, longitude, altitude), declination)
+
+    def _first_attitude(
+        self, t: int, window: Array, rest: bool, site: Site
+    ) -> tuple[Array, float, str] | None:
+        c = self.config
+        sigma = c.initialisation.yaw_sigma_rad
+        force = window[:, 3:].mean(axis=0)
+        gravity = normal_gravity(site.origin[0], site.origin[2])
+        if not rest and self._attitude is not None and t - self._attitude[0] < FRESH_NS:
+            return self._attitude[1], sigma, "in flight, from the autopilot's attitude"
+        up = np.array([0.0, 0.0, -gravity]) if rest else self._acceleration() - [0.0, 0.0, gravity]
+        where = "at rest" if rest else "in flight"
+        if self._mag is not None:
+            if t - self._mag[0] > FRESH_NS:
+                return None
+            yaw = 0.0
+            q = _attitude_from(force, up, yaw)
+            for _ in range(4):
+                m = quat_to_matrix(q) @ self._mag[1]
+                yaw = wrap_pi(yaw + site.declination_rad - math.atan2(m[1], m[0]))
+                q = _attitude_from(force, up, yaw)
+            return q, sigma, f"{where}, heading from the magnetometer"
+        if self._attitude is not None and t - self._attitude[0] < FRESH_NS:
+            yaw = float(quat_to_euler(self._attitude[1])[2])
+            return _attitude_from(force, up, yaw), sigma, f"{where}, heading from the autopilot's attitude"
+        found = self._heading_from_motion()
+        if found is None or found[1] > sigma or self._level is None:
+            return None
+        turn = euler_to_quat(0.0, 0.0, found[0])
+        q = quat_normalise(quat_multiply(turn, self._level))
+        return q, sigma, "in flight, heading from horizontal acceleration"
+
+    def _acceleration(self) -> Array:
+        """Return the mean NED acceleration over the window, from GPS velocities."""
+        t1, v1, _ = self._velocities[-1]
+        begin = t1 - int(1.5e9 * self.config.initialisation.rest_s)
+        t0, v0, _ = next(v for v in self._velocities if v[0] >= begin)
+        if t1 - t0 < 0.3e9:
+            return np.zeros(3)
+        a = (v1 - v0) / ((t1 - t0) * 1e-9)
+        return np.where(np.isfinite(a), a, 0.0)
+
+    def _state(self, t: int, q: Array, yaw_sigma: float, rest: bool, velocity: Array, site: Site) -> FilterState:
+        assert self._fix is not None
+        c, o = self.config, self.layout.offsets
+        window = self._window()
+        x = nominal_zero()
+        fix_t, fix, own = self._fix
+        up_to_date = np.where(np.isfinite(velocity), velocity, 0.0)
+        x[P0 : P0 + 3] = geodetic_to_ned(*fix, np.array(site.origin)) + up_to_date * ((t - fix_t) * 1e-9)
+        x[V0 : V0 + 3] = 0.0 if rest else up_to_date
+        x[Q0 : Q0 + 4] = q
+        bias_known = rest or self.gyro_bias is not None
+        if rest:
+            x[BG0 : BG0 + 3] = window[:, :3].mean(axis=0)
+        elif self.gyro_bias is not None:
+            x[BG0 : BG0 + 3] = self.gyro_bias
+        P = np.zeros((self.layout.size, self.layout.size))
+
+        def put(block: int, variances: Array) -> None:
+            start = int(o[block])
+            P[start : start + len(variances), start : start + len(variances)] = np.diag(variances)
+
+        stated = np.where(np.isfinite(own[[0, 3, 5]]), own[[0, 3, 5]], 0.0)
+        g = c.gps
+        floor = np.array([g.position_sigma_m, g.position_sigma_m, g.height_sigma_m]) ** 2
+        white = np.maximum(floor, stated * (g.white_fraction**2 if g.bias else 1.0))
+        put(POSITION, white)
+        put(VELOCITY, np.array([g.velocity_sigma_mps, g.velocity_sigma_mps, g.climb_sigma_mps]) ** 2 * 4.0)
+        tilt = c.initialisation.tilt_sigma_rad if rest else c.initialisation.flight_tilt_sigma_rad
+        R = quat_to_matrix(q)
+        a = int(o[ATTITUDE])
+        P[a : a + 3, a : a + 3] = R.T @ np.diag([tilt**2, tilt**2, yaw_sigma**2]) @ R
+        put(GYRO_BIAS, np.full(3, (0.1 if bias_known else 1.0) * c.imu.gyro_bias_sigma) ** 2)
+        put(ACCEL_BIAS, np.full(3, c.imu.accel_bias_sigma**2))
+        if o[GPS_BIAS] >= 0:
+            bias = np.array([g.bias_sigma_m, g.bias_sigma_m, g.height_bias_sigma_m]) ** 2
+            put(GPS_BIAS, bias)
+            p, b = int(o[POSITION]), int(o[GPS_BIAS])
+            # position = fix - bias
+            for i in range(3):
+                P[p + i, p + i] += bias[i]
+                P[p + i, b + i] = P[b + i, p + i] = -bias[i]
+        if o[BARO_BIAS] >= 0:
+            k, d = int(o[BARO_BIAS]), int(o[POSITION]) + 2
+            if self._pressure is not None:
+                # offset = pressure altitude - height: known as well as the height is.
+                x[BB0] = pressure_altitude(self._pressure[1]) - site.origin[2] + x[P0 + 2]
+                P[k, :] = P[d, :]
+                P[:, k] = P[:, d]
+                P[k, k] = P[d, d] + c.barometer.sigma_m**2
+            else:
+                P[k, k] = 100.0**2
+        lock = np.zeros((self.sensors, 6))
+        clock = np.array([t, t, t], dtype=np.int64)
+        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(2), lock)
+
+
+def _attitude_from(force: Array, up: Array, yaw: float) -> Array:
+    """Return the body-to-NED quaternion with that yaw [rad] that takes the specific force to the direction ``up``.
+
+    ``force`` is in body axes, ``up`` in NED (both point up at rest).
+    """
+    c, s = math.cos(yaw), math.sin(yaw)
+    f = force / np.linalg.norm(force)
+    u = np.array([c * up[0] + s * up[1], -s * up[0] + c * up[1], up[2]]) / np.linalg.norm(up)
+    r = math.hypot(f[1], f[2])
+    alpha = math.atan2(f[2], f[1])
+    angle = math.acos(min(1.0, max(-1.0, u[1] / max(r, 1e-9))))
+    candidates = [wrap_pi(angle - alpha), wrap_pi(-angle - alpha)]
+    roll = min(candidates, key=abs)
+    z = f[1] * math.sin(roll) + f[2] * math.cos(roll)
+    pitch = wrap_pi(math.atan2(u[0], u[2]) - math.atan2(f[0], z))
+    return euler_to_quat(roll, pitch, yaw)
+
+
+def world_magnetic_declination(latitude_rad: float, longitude_rad: float, altitude_m: float, utc_s: float) -> float:
+    """Return the declination [rad, east positive] of the World Magnetic Model at a place and date.
+
+    Dates outside the model's five years are taken at its nearer end.
+    """
+    from pygeomag import GeoMag
+
+    year = min(2029.99, max(2025.0, 1970.0 + utc_s / 31_556_952.0))
+    model = GeoMag(coefficients_file="wmm/WMM_2025.COF")
+    height_km = min(100.0, max(-1.0, altitude_m / 1000.0))
+    result = model.calculate(math.degrees(latitude_rad), math.degrees(longitude_rad), height_km, year)
+    return math.radians(float(result.d))

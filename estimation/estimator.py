@@ -1,0 +1,550 @@
+"""The estimator: events in, estimates and fusion records out.
+
+``step`` takes one event, ``run`` a whole batch; both go through the same code and give the same bits. No clock,
+file, socket or thread is touched: time is what the events say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.alignment import Aligner
+from estimation.clockbank import ClockBank
+from estimation.config import Config, ConfigError
+from estimation.events import (
+    AUTOPILOT,
+    COMPANION,
+    EVENT_DTYPE,
+    Event,
+    EventBatch,
+    Kind,
+    Names,
+    TimeSync,
+    pack,
+    unpack,
+)
+from estimation.filter import Model
+from estimation.frames import Array
+from estimation.history import Engine, History
+from estimation.outcome import Outcome
+from estimation.parameters import Site, pack_parameters
+from estimation.rows import PENDING, Estimates, FilterState, Int, Rows
+from estimation.state import BA0, BG0, P0, Q0, V0, Layout
+
+EngineName = Literal["auto", "filterpy", "compiled"]
+
+RECORD_DTYPE = np.dtype(
+    [
+        ("t_ns", np.int64),
+        ("stamp_ns", np.int64),
+        ("arrival_ns", np.int64),
+        ("sensor", np.int16),
+        ("outcome", np.int16),
+        ("dof", np.int16),
+        ("nis", np.float64),
+        ("innovation", np.float64, (3,)),
+        ("sigma", np.float64, (3,)),
+        ("age_s", np.float64),
+    ]
+)
+"""One fusion attempt: time of the content on the estimator's clock, the event's own stamp and arrival, the sensor's
+index, ``Outcome``, degrees of freedom, NIS, innovation with its predicted 1-sigma (NaN where there was no
+comparison), and the age at arrival."""
+
+REWIND_SPAN_NS = 200_000_000
+REWIND_COUNT = 20
+"""An inertial clock has gone back when this many samples over this span all are too old."""
+
+MEASURED_3D = (Kind.GPS_POSITION, Kind.GPS_VELOCITY, Kind.VISION)
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What the source of the events knows beforehand, used where the configuration leaves it open.
+
+    ``imu_latency_s`` is the age of an inertial sample at its stamp (filter delay); ``declination_rad`` is east
+    positive.
+    """
+
+    imu_latency_s: float = 0.0
+    declination_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """The vehicle at ``t_ns`` of the inertial clock.
+
+    ``position_m`` and ``velocity_mps`` are NED from the origin, ``quaternion`` takes body to NED, ``covariance``
+    (9, 9) is of position, velocity and attitude error (rotation vector in the body frame). ``sigma`` has the
+    1-sigma of every entry of the error state, ``nominal`` the whole state (``estimation.state``).
+    """
+
+    t_ns: int
+    position_m: Array
+    velocity_mps: Array
+    quaternion: Array
+    covariance: Array
+    nominal: Array
+    sigma: Array
+
+
+@dataclass(slots=True)
+class Output:
+    """What one event led to: an estimate (after an inertial sample), records that became final, notes."""
+
+    estimate: Estimate | None
+    records: NDArray[np.void]
+    notes: list[tuple[int, str]]
+
+
+@dataclass(slots=True)
+class Run:
+    """What a batch led to, as columns of n estimates.
+
+    ``t_ns`` inertial clock; ``position_m``, ``velocity_mps`` (n, 3) NED; ``quaternion`` (n, 4) body to NED;
+    ``covariance`` (n, 9, 9) of position, velocity and attitude error (body frame); ``gyro_bias``, ``accel_bias``
+    (n, 3); ``nominal`` (n, 40) and ``sigma`` (n, k) with ``state_names`` and ``state_units``. ``records`` has
+    ``RECORD_DTYPE``; ``sensors`` are the names that its indices mean; ``notes`` are (t_ns, sentence).
+    ``imu_outcomes`` counts the inertial samples. ``origin`` is latitude [rad], longitude [rad], altitude [m], or
+    None where the filter never started; ``missing`` says then what it waited for.
+    """
+
+    engine: str
+    t_ns: Int
+    position_m: Array
+    velocity_mps: Array
+    quaternion: Array
+    covariance: Array
+    gyro_bias: Array
+    accel_bias: Array
+    nominal: Array
+    sigma: Array
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    records: NDArray[np.void]
+    sensors: tuple[str, ...]
+    notes: list[tuple[int, str]]
+    imu_outcomes: dict[Outcome, int]
+    origin: tuple[float, float, float] | None
+    declination_rad: float | None
+    missing: str
+
+
+@dataclass(slots=True)
+class LandingEstimator:
+    """State estimation of the vehicle (and, as it is switched on, of the platform) from events.
+
+    ``engine`` is ``"compiled"`` (needs numba), ``"filterpy"`` (the reference, and the one for sensors added with
+    ``add_sensor``) or ``"auto"``. ``facts`` are used where the configuration leaves a value open.
+    """
+
+    config: Config = field(default_factory=Config)
+    engine: EngineName = "auto"
+    facts: Facts = field(default_factory=Facts)
+    layout: Layout = field(init=False)
+    engine_name: str = field(init=False)
+    _names: Names = field(default_factory=Names)
+    _history: History = field(init=False)
+    _engine: Engine | None = None
+    _aligner: Aligner = field(init=False)
+    _clocks: ClockBank = field(init=False)
+    _site: Site | None = None
+    _consumed: int = 0
+    _next_id: int = 0
+    _models: dict[str, tuple[Model, float]] = field(default_factory=dict)
+    _latency: Array = field(init=False)
+    _period_ns: int = field(init=False)
+    _past: list[tuple[int, int]] = field(default_factory=list)
+    _estimates: list[Estimates] = field(default_factory=list)
+    _records: list[NDArray[np.void]] = field(default_factory=list)
+    _notes: list[tuple[int, str]] = field(default_factory=list)
+    _imu_outcomes: dict[Outcome, int] = field(default_factory=dict)
+    _utc_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise ``ConfigError`` for an engine that is not there."""
+        c = self.config
+        self.layout = Layout.of(c)
+        self.engine_name = _choose(self.engine)
+        self._history = History(int(c.filter.window_s * 1e9))
+        self._clocks = ClockBank(AUTOPILOT)
+        self._period_ns = round(1e9 / c.filter.output_rate_hz) if c.filter.output_rate_hz else 0
+        imu_latency = self.facts.imu_latency_s if c.imu.latency_s is None else c.imu.latency_s
+        latency = np.zeros(len(Kind))
+        latency[Kind.IMU] = imu_latency
+        latency[Kind.GPS_POSITION] = latency[Kind.GPS_VELOCITY] = c.gps.latency_s
+        latency[Kind.BAROMETER] = c.barometer.latency_s
+        latency[Kind.MAGNETOMETER] = c.magnetometer.latency_s
+        latency[Kind.ATTITUDE] = c.attitude.latency_s
+        latency[Kind.RANGEFINDER] = c.rangefinder.latency_s
+        self._latency = np.round(latency * 1e9)
+        self._new_aligner()
+
+    @property
+    def ready(self) -> bool:
+        """True once estimates come out."""
+        return self._engine is not None
+
+    def add_sensor(self, name: str, model: Model, latency_s: float = 0.0) -> None:
+        """Take measurements of a sensor of the user's (events ``UserMeasurement`` with this name).
+
+        ``model(value, nominal, layout)`` returns innovation (m,), Jacobian (m, n) and covariance (m, m), m from 1 to
+        3; ``estimation.consistency.check_jacobian`` tests it. Raises ``ConfigError`` with the compiled engine.
+        """
+        if self.engine_name != "filterpy":
+            raise ConfigError(f"sensor {name!r}: needs engine='filterpy'; the compiled engine has no user models")
+        self._models[name] = (model, latency_s)
+
+    def step(self, event: Event) -> Output:
+        """Take one event, in the order of arrival."""
+        row = np.array([pack(event, self._names)], dtype=EVENT_DTYPE)
+        self._take(row)
+        out = self._collect()
+        last = out[0].count - 1
+        return Output(_estimate(out[0], last) if last >= 0 else None, out[1], out[2])
+
+    def run(self, batch: EventBatch) -> Run:
+        """Take a batch, in its order, to its end, and return all that it led to."""
+        rows = batch.rows.copy()
+        sensors = np.array([self._names.sensor(s) for s in batch.sensors] or [0], dtype=np.int16)
+        clocks = np.array([self._names.clock(c) for c in batch.clocks] or [0], dtype=np.int16)
+        rows["sensor"] = sensors[batch.rows["sensor"]]
+        rows["clock"] = clocks[batch.rows["clock"]]
+        self._take(rows, batch.timesync_reference)
+        self.finish()
+        return self._as_run(*self._collect())
+
+    def finish(self) -> None:
+        """Settle what is still in the window; measurements that no inertial sample followed were in the future."""
+        h = self._history
+        if self._engine is None:
+            self._not_ready(h.size)
+            return
+        self._settle(h.settle(everything=True))
+        rest = h.rows.take(np.arange(h.size))
+        rest.outcome[:] = Outcome.REJECTED_FUTURE
+        self._settle(rest)
+        h.drop(h.size)
+
+    # -- intake ------------------------------------------------------------------------------------------------
+
+    def _take(self, rows: NDArray[np.void], timesync_reference: str = COMPANION) -> None:
+        ids = self._next_id + np.arange(len(rows))
+        self._next_id += len(rows)
+        if len(rows) and self._utc_s == 0.0:
+            self._utc_s = float(rows["arrival_ns"][0]) * 1e-9
+            self._aligner.utc_s = self._utc_s
+        t, known = self._content_times(rows, timesync_reference)
+        r = Rows.empty(len(rows))
+        r.t_ns[:], r.kind[:], r.sensor[:], r.id[:] = t, rows["kind"], rows["sensor"], ids
+        r.stamp_ns[:], r.arrival_ns[:] = rows["stamp_ns"], rows["arrival_ns"]
+        r.value[:], r.own[:] = rows["value"], rows["covariance"]
+        r.outcome[:] = _malformed(r)
+        r.outcome[~known] = Outcome.REJECTED_NOT_READY
+        r = r.take(np.flatnonzero(r.kind != Kind.TIMESYNC))
+        bad = r.outcome != PENDING
+        self._reject(r.take(np.flatnonzero(bad)))
+        self._feed(r.take(np.flatnonzero(~bad)))
+
+    def _content_times(
+        self, rows: NDArray[np.void], timesync_reference: str
+    ) -> tuple[Int, NDArray[np.bool_]]:
+        """Return the time of each event's content on the inertial clock, map(stamp) - latency, and where it is known."""
+        t: Int = rows["stamp_ns"].astype(np.int64)
+        known = np.ones(len(rows), dtype=bool)
+        home = self._names.clocks.index(AUTOPILOT)
+        kind = rows["kind"]
+        for i in np.flatnonzero((rows["clock"] != home) | (kind == Kind.TIMESYNC) | (kind == Kind.GPS_POSITION)):
+            event = unpack(rows[i], self._names.sensors, self._names.clocks, timesync_reference)
+            if isinstance(event, TimeSync):
+                self._clocks.exchange(event)
+                continue
+            self._clocks.observe(event.clock, event.stamp_ns, event.arrival_ns)
+            reading = self._clocks.convert(event.clock, event.stamp_ns)
+            known[i] = reading is not None
+            if reading is not None:
+                t[i] = reading.time_ns
+        latency = self._latency[rows["kind"]]
+        for name, (_, seconds) in self._models.items():
+            latency = np.where(rows["sensor"] == self._names.sensor(name), round(seconds * 1e9), latency)
+        result: Int = t - latency.astype(np.int64)
+        return result, known
+
+    def _feed(self, r: Rows) -> None:
+        """Take well-formed rows in the order of arrival."""
+        h, n, i = self._history, len(r.t_ns), 0
+        window = h.window_ns
+        gap = max(window, int(self.config.imu.gap_s * 1e9))
+        is_imu = r.kind == Kind.IMU
+        while i < n:
+            if self._engine is None:
+                self._feed_before_start(r.take(slice(i, i + 1)))
+                i += 1
+                continue
+            assert h.newest_ns is not None
+            t = r.t_ns[i:]
+            imu_t = np.where(is_imu[i:], t, np.iinfo(np.int64).min)
+            newest = np.maximum.accumulate(np.concatenate(([h.newest_ns], imu_t)))[:-1]
+            r.age_ns[i:] = newest - t
+            too_old = t < newest - window
+            late = (t < newest) | (is_imu[i:] & (t == newest))
+            jump = is_imu[i:] & (t > newest + gap)
+            stop = np.flatnonzero((late & ~too_old) | (too_old & is_imu[i:]) | jump)
+            b = int(stop[0]) if len(stop) else n - i
+            if b > 0:
+                self._insert(r.take(slice(i, i + b)), newest[:b], too_old[:b])
+                self._advance()
+                i += b
+                continue
+            if jump[0]:
+                self._restart(f"no inertial sample for {(t[0] - newest[0]) * 1e-9:.1f} s")
+                continue
+            if too_old[0]:
+                if self._clock_went_back(int(t[0])):
+                    continue
+                self._reject_as(r.take(slice(i, i + 1)), Outcome.REJECTED_TOO_OLD)
+                i += 1
+                continue
+            # A run of late events: put all in place, rewind once, when the next inertial sample comes.
+            more = np.flatnonzero(~(late & ~too_old))
+            e = int(more[0]) if len(more) else n - i
+            group = r.take(slice(i, i + e))
+            group.late[:] = 1
+            self._insert(group, newest[:e], too_old[:e])
+            i += e
+
+    def _insert(self, rows: Rows, newest: Int, too_old: NDArray[np.bool_]) -> None:
+        """Put rows in the history, less those outside its window."""
+        h = self._history
+        future = (rows.t_ns > newest + h.window_ns) & (rows.kind != Kind.IMU)
+        for mask, outcome in ((too_old, Outcome.REJECTED_TOO_OLD), (future, Outcome.REJECTED_FUTURE)):
+            if mask.any():
+                self._reject_as(rows.take(np.flatnonzero(mask)), outcome)
+        good = ~(too_old | future)
+        rows = rows if good.all() else rows.take(np.flatnonzero(good))
+        imu = rows.kind == Kind.IMU
+        if imu.any():
+            top = int(rows.t_ns[imu].max())
+            h.newest_ns = top if h.newest_ns is None else max(h.newest_ns, top)
+            self._past.clear()
+        repeated = h.insert(rows)
+        if len(repeated):
+            self._reject_as(rows.take(np.flatnonzero(np.isin(rows.id, repeated))), Outcome.REJECTED_DUPLICATE)
+
+    def _advance(self) -> None:
+        h = self._history
+        assert self._engine is not None
+        room = int(np.count_nonzero(h.rows.kind[h.done : h.size] == Kind.IMU))
+        if room == 0:
+            return
+        out = Estimates.empty(room, self.layout.size)
+        h.advance(self._engine, out, self._period_ns)
+        if out.count:
+            self._estimates.append(out.filled())
+        self._settle(h.settle())
+
+    def _feed_before_start(self, row: Rows) -> None:
+        h = self._history
+        t = int(row.t_ns[0])
+        newest = t if h.newest_ns is None else h.newest_ns
+        imu = int(row.kind[0]) == Kind.IMU
+        old = np.array([h.newest_ns is not None and t < newest - h.window_ns])
+        if imu and old[0] and self._clock_went_back(t):
+            old[:] = False
+            newest = t
+        row.age_ns[0] = newest - t
+        if h.newest_ns is None and not imu:
+            self._reject_as(row, Outcome.REJECTED_NOT_READY)
+            return
+        self._insert(row, np.array([newest]), old)
+        if not imu or h.newest_ns is None:
+            return
+        horizon = h.newest_ns - h.window_ns
+        stop = int(np.searchsorted(h.rows.t_ns[: h.size], horizon, side="right"))
+        if stop <= self._consumed:
+            return
+        started = self._aligner.consume(h.rows, self._consumed, stop)
+        if started is None:
+            self._consumed = 0
+            self._not_ready(stop)
+            return
+        at, aligned = started
+        self._consumed = 0
+        self._site = aligned.site
+        self._engine = self._start(aligned.state)
+        self._notes.append((int(aligned.state.clock[0]), f"initialised {aligned.note}"))
+        self._not_ready(at)
+        h.begin(self._engine, 0)
+        h.emitted_ns = max(h.emitted_ns, h.newest_ns - 1)
+        self._advance()
+
+    def _start(self, state: FilterState) -> Engine:
+        assert self._site is not None
+        p = pack_parameters(self.config, self._site)
+        if self.engine_name == "compiled":
+            from estimation.compiled import CompiledEngine
+
+            return CompiledEngine.start(p, self.layout, state)
+        from estimation.filter import FilterPyEngine
+
+        users = {self._names.sensor(name): model for name, (model, _) in self._models.items()}
+        return FilterPyEngine.start(p, self.layout, state, users)
+
+    def _new_aligner(self) -> None:
+        declination = self.config.magnetometer.declination_deg
+        known = self.facts.declination_rad if declination is None else np.radians(declination)
+        self._aligner = Aligner(self.config, self.layout, 64, known, self._utc_s, self._site)
+
+    def _restart(self, why: str) -> None:
+        """Settle all, and align anew with what is known of the site and the gyro."""
+        h = self._history
+        t = h.newest_ns or 0
+        bias = None
+        if self._engine is not None:
+            self._settle(h.settle(everything=True))
+            bias = self._engine.state.x[BG0 : BG0 + 3].copy()
+        self._notes.append((t, f"{why}: aligning again"))
+        h.drop(h.size)
+        h.checkpoints.clear()
+        self._engine = None
+        self._consumed = 0
+        self._new_aligner()
+        self._aligner.gyro_bias = bias
+        h.newest_ns = None
+
+    def _clock_went_back(self, t: int) -> bool:
+        """Note an inertial sample that is too old; return True, having restarted, when the clock itself went back."""
+        if self._past and t < self._past[-1][0]:
+            self._past.clear()
+        self._past.append((t, 0))
+        if len(self._past) < REWIND_COUNT or t - self._past[0][0] < REWIND_SPAN_NS:
+            return False
+        newest = self._history.newest_ns or t
+        self._past.clear()
+        self._restart(f"the inertial clock went back by {(newest - t) * 1e-9:.1f} s")
+        self._history.emitted_ns = t
+        return True
+
+    # -- records -----------------------------------------------------------------------------------------------
+
+    def _not_ready(self, count: int) -> None:
+        """Forget the first rows of the history, which came before the filter was ready."""
+        rows = self._history.rows.take(np.arange(count))
+        rows.outcome[:] = np.where(rows.kind == Kind.IMU, Outcome.FUSED, Outcome.REJECTED_NOT_READY)
+        rows.result[:] = 0.0
+        self._settle(rows)
+        self._history.drop(count)
+
+    def _reject_as(self, rows: Rows, outcome: Outcome) -> None:
+        rows.outcome[:] = outcome
+        self._reject(rows)
+
+    def _reject(self, rows: Rows) -> None:
+        rows.result[:] = 0.0
+        self._settle(rows)
+
+    def _settle(self, rows: Rows) -> None:
+        """Keep the final records of rows."""
+        if not len(rows.t_ns):
+            return
+        imu = rows.kind == Kind.IMU
+        for outcome, count in zip(*np.unique(rows.outcome[imu], return_counts=True), strict=True):
+            key = Outcome.FUSED if outcome == PENDING else Outcome(int(outcome))
+            self._imu_outcomes[key] = self._imu_outcomes.get(key, 0) + int(count)
+        kept = np.flatnonzero(~imu | (rows.outcome > Outcome.DOWNWEIGHTED))
+        if not len(kept):
+            return
+        r = rows.take(kept)
+        records = np.zeros(len(kept), dtype=RECORD_DTYPE)
+        records["t_ns"], records["stamp_ns"], records["arrival_ns"] = r.t_ns, r.stamp_ns, r.arrival_ns
+        records["sensor"], records["outcome"] = r.sensor, r.outcome
+        records["dof"] = r.result[:, 1]
+        compared = r.result[:, 1] > 0
+        records["nis"] = np.where(compared, r.result[:, 0], np.nan)
+        axis = np.arange(3) < r.result[:, 1:2]
+        records["innovation"] = np.where(axis, r.result[:, 2:5], np.nan)
+        records["sigma"] = np.where(axis, r.result[:, 5:8], np.nan)
+        records["age_s"] = r.age_ns * 1e-9
+        self._records.append(records)
+        for i in np.flatnonzero(r.reset):
+            name = self._names.sensors[int(r.sensor[i])]
+            size = float(np.linalg.norm(r.result[i, 2:5]))
+            self._notes.append((int(r.t_ns[i]), f"{name} contradicted the filter for long: moved onto it by {size:.1f} m"))
+
+    def _collect(self) -> tuple[Estimates, NDArray[np.void], list[tuple[int, str]]]:
+        estimates = Estimates.concatenate(self._estimates, self.layout.size)
+        records = np.concatenate(self._records) if self._records else np.empty(0, dtype=RECORD_DTYPE)
+        notes = list(self._notes)
+        self._estimates.clear()
+        self._records.clear()
+        self._notes.clear()
+        return estimates, records, notes
+
+    def _as_run(self, e: Estimates, records: NDArray[np.void], notes: list[tuple[int, str]]) -> Run:
+        x = e.x
+        records = records[np.lexsort((records["sensor"], records["t_ns"]))]
+        return Run(
+            engine=self.engine_name,
+            t_ns=e.t_ns,
+            position_m=x[:, P0 : P0 + 3],
+            velocity_mps=x[:, V0 : V0 + 3],
+            quaternion=x[:, Q0 : Q0 + 4],
+            covariance=e.covariance,
+            gyro_bias=x[:, BG0 : BG0 + 3],
+            accel_bias=x[:, BA0 : BA0 + 3],
+            nominal=x,
+            sigma=e.sigma,
+            state_names=self.layout.names,
+            state_units=self.layout.units,
+            records=records,
+            sensors=tuple(self._names.sensors),
+            notes=notes,
+            imu_outcomes=dict(self._imu_outcomes),
+            origin=self._site.origin if self._site else None,
+            declination_rad=self._site.declination_rad if self._site else None,
+            missing="" if self._engine is not None else self._aligner.missing,
+        )
+
+
+def _choose(engine: EngineName) -> str:
+    """Return the engine to use; raises ``ConfigError``."""
+    import importlib.util
+
+    if engine not in ("auto", "filterpy", "compiled"):
+        raise ConfigError(f"engine {engine!r} is unknown; use auto, filterpy or compiled")
+    numba = importlib.util.find_spec("numba") is not None
+    if engine == "compiled" and not numba:
+        raise ConfigError("engine 'compiled' needs numba; install deckfix[fast] or use engine 'filterpy'")
+    return "compiled" if engine != "filterpy" and numba else "filterpy"
+
+
+def _malformed(rows: Rows) -> Int:
+    """Return for each row the outcome of a measurement that is malformed in itself, or ``PENDING``."""
+    outcome = np.full(len(rows.t_ns), PENDING, dtype=np.int64)
+    needed = np.array([6, 0, 3, 2, 1, 3, 4, 1, 3, 1])[rows.kind]
+    used = np.arange(6) < needed[:, None]
+    outcome[(used & ~np.isfinite(rows.value)).any(axis=1)] = Outcome.REJECTED_NOT_FINITE
+    c = rows.own
+    stated = ~np.isnan(c).all(axis=1) & np.isin(rows.kind, MEASURED_3D)
+    if stated.any():
+        a, b, d, e, f, g = c.T
+        with np.errstate(all="ignore"):
+            minor = a * e - b * b
+            det = a * (e * g - f * f) - b * (b * g - f * d) + d * (b * f - e * d)
+            positive = (a > 0) & (minor > 0) & (det > 0)
+        # A receiver without a vertical velocity states no variance for it.
+        planar = (rows.kind == Kind.GPS_VELOCITY) & np.isnan(g) & (a > 0) & (e > 0)
+        outcome[stated & ~positive & ~planar & (outcome == PENDING)] = Outcome.REJECTED_COVARIANCE
+    return outcome
+
+
+def _estimate(e: Estimates, i: int) -> Estimate:
+    x = e.x[i]
+    return Estimate(
+        int(e.t_ns[i]), x[P0 : P0 + 3], x[V0 : V0 + 3], x[Q0 : Q0 + 4], e.covariance[i], x, e.sigma[i]
+    )
+

@@ -1,0 +1,182 @@
+"""Rewinding: events in any order of arrival, results as if they had come in the order of their content.
+
+The history keeps the events of the last ``window`` in the order of their content, with checkpoints of the engine
+among them. A late event is put where it belongs; before the next estimate the engine goes back to the last
+checkpoint before it and runs forward again. The order is total (time, kind, sensor, content), so the result is a
+function of the set of events alone, to the last bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from estimation.outcome import Outcome
+from estimation.rows import Estimates, FilterState, Int, Rows
+
+IMU = 0
+CHECKPOINT_NS = 50_000_000
+"""Spacing of the checkpoints: what a rewind runs again beyond the event's own age, at most."""
+
+
+class Engine(Protocol):
+    """What the history asks of an engine; ``estimation.filter`` and ``estimation.compiled`` have it."""
+
+    state: FilterState
+
+    def save(self) -> FilterState:
+        """Return a checkpoint."""
+
+    def load(self, saved: FilterState) -> None:
+        """Go back to a checkpoint."""
+
+    def advance(self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int) -> None:
+        """Process the rows start..stop in order, the last of which is an inertial sample."""
+
+
+@dataclass(slots=True)
+class History:
+    """The window of events, the part of it that is done, and the checkpoints in it.
+
+    ``done`` rows are behind the engine; ``stale`` is set while the engine is past an insertion and must go back.
+    ``newest_ns`` is the time of the newest inertial sample that arrived. ``checkpoints`` pair a row's index, all
+    rows up to and including which are in the saved state, with that state.
+    """
+
+    window_ns: int
+    rows: Rows = field(default_factory=lambda: Rows.empty(1024))
+    size: int = 0
+    done: int = 0
+    stale: bool = False
+    newest_ns: int | None = None
+    emitted_ns: int = 0
+    checkpoints: list[tuple[int, FilterState]] = field(default_factory=list)
+
+    def insert(self, new: Rows) -> Int:
+        """Put events where they belong; return the ids of exact repetitions, which are left out."""
+        n = len(new.t_ns)
+        if n == 0:
+            return np.empty(0, dtype=np.int64)
+        place = self.size
+        first = int(new.t_ns.min())
+        if place and self.rows.t_ns[place - 1] >= first:
+            place = int(np.searchsorted(self.rows.t_ns[:place], first, side="left"))
+        merged = Rows.concatenate(self.rows.take(slice(place, self.size)), new) if place < self.size else new
+        order = _order(merged)
+        repeated = _repetitions(merged, order)
+        left_out = merged.id[order[repeated]]
+        order = order[~repeated]
+        old = self.size - place
+        # Where the order first departs from what was there, what is behind must be done again.
+        kept = order[:old] == np.arange(min(old, len(order)))
+        first_changed = place + (old if kept.all() and len(kept) == old else int(np.argmin(kept)))
+        self._reserve(place + len(order))
+        self.rows.write(place, merged.take(order))
+        self.size = place + len(order)
+        if first_changed < self.done:
+            # Measurements between two inertial samples were taken with an interpolation between them, which an
+            # insertion may change: all since the sample before is done again.
+            back = first_changed
+            while back > 0 and self.rows.kind[back - 1] != IMU:
+                back -= 1
+            while self.checkpoints[-1][0] >= back:
+                self.checkpoints.pop()
+            self.done = self.checkpoints[-1][0] + 1
+            self.stale = True
+        return left_out
+
+    def begin(self, engine: Engine, at: int) -> None:
+        """Start: the engine's state holds all rows before index ``at``."""
+        self.checkpoints = [(at - 1, engine.save())]
+        self.done = at
+        self.stale = False
+
+    def advance(self, engine: Engine, out: Estimates, period_ns: int) -> None:
+        """Run the engine to the newest inertial sample, rewinding first where something was inserted."""
+        stop = self.size
+        while stop > self.done and self.rows.kind[stop - 1] != IMU:
+            stop -= 1
+        if stop <= self.done:
+            return
+        if self.stale:
+            engine.load(self.checkpoints[-1][1])
+            self.stale = False
+        t = self.rows.t_ns
+        is_imu = self.rows.kind[self.done : stop] == IMU
+        imu_at = self.done + np.flatnonzero(is_imu)
+        grid = t[imu_at] // CHECKPOINT_NS
+        last = self.checkpoints[-1][1].clock[0] // CHECKPOINT_NS
+        fresh = np.empty(len(grid), dtype=bool)
+        fresh[0] = grid[0] != last
+        fresh[1:] = grid[1:] != grid[:-1]
+        fresh &= t[imu_at] >= t[stop - 1] - self.window_ns - 2 * CHECKPOINT_NS
+        for index in imu_at[fresh]:
+            engine.advance(self.rows, self.done, int(index) + 1, out, self.emitted_ns, period_ns)
+            self.done = int(index) + 1
+            self.checkpoints.append((int(index), engine.save()))
+        if self.done < stop:
+            engine.advance(self.rows, self.done, stop, out, self.emitted_ns, period_ns)
+            self.done = stop
+        self.emitted_ns = max(self.emitted_ns, int(t[stop - 1]))
+
+    def settle(self, everything: bool = False) -> Rows:
+        """Forget and return the rows that nothing can change any more (all that are done, for ``everything``)."""
+        if self.newest_ns is None or not self.checkpoints:
+            return Rows.empty(0)
+        if everything:
+            cut = self.done
+        else:
+            limit = self.newest_ns - self.window_ns
+            keep = 0
+            while keep + 1 < len(self.checkpoints) and self.checkpoints[keep + 1][1].clock[0] < limit:
+                keep += 1
+            if keep == 0:
+                return Rows.empty(0)
+            cut = self.checkpoints[keep][0] + 1
+            del self.checkpoints[:keep]
+        if cut <= 0:
+            return Rows.empty(0)
+        settled = self.rows.take(np.arange(cut))
+        self.drop(cut)
+        return settled
+
+    def drop(self, count: int) -> None:
+        """Forget the first ``count`` rows."""
+        rest = self.rows.take(np.arange(count, self.size))
+        self.rows.write(0, rest)
+        self.size -= count
+        self.done = max(0, self.done - count)
+        self.checkpoints = [(i - count, s) for i, s in self.checkpoints]
+
+    def _reserve(self, n: int) -> None:
+        capacity = len(self.rows.t_ns)
+        if n > capacity:
+            grown = Rows.empty(max(n, 2 * capacity))
+            grown.write(0, self.rows.take(slice(0, self.size)))
+            self.rows = grown
+
+
+def _order(rows: Rows) -> Int:
+    """Return the order by time, kind, sensor, value, covariance and last by arrival."""
+    order = np.lexsort((rows.kind, rows.t_ns))
+    t, k = rows.t_ns[order], rows.kind[order]
+    if np.any((t[1:] == t[:-1]) & (k[1:] == k[:-1])):
+        keys = [rows.id, *rows.own.T[::-1], *rows.value.T[::-1], rows.sensor, rows.kind, rows.t_ns]
+        order = np.lexsort(keys)
+    return order.astype(np.int64)
+
+
+def _repetitions(rows: Rows, order: Int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Return, in that order, which rows repeat the one before them in all but the order of arrival."""
+    repeated = np.zeros(len(order), dtype=bool)
+    t, k = rows.t_ns[order], rows.kind[order]
+    for i in np.flatnonzero((t[1:] == t[:-1]) & (k[1:] == k[:-1])):
+        a, b = int(order[i]), int(order[i + 1])
+        repeated[i + 1] = (
+            rows.sensor[a] == rows.sensor[b]
+            and np.array_equal(rows.value[a], rows.value[b], equal_nan=True)
+            and np.array_equal(rows.own[a], rows.own[b], equal_nan=True)
+        )
+    return repeated
