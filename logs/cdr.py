@@ -1,14 +1,15 @@
 """Fixed layouts: the CDR encoding of a ROS 2 message as one packed NumPy structured type.
 
-CDR has no tags: once the strings and the lengths of the sequences of a message are known, every number of
-it stands at a known byte. ``Layout`` holds that knowledge, so that messages are packed and read as whole columns:
+CDR has no tags: once the strings and the lengths of the sequences of a message are known, every number of it
+stands at a known byte. ``Layout`` holds that knowledge, so that messages are packed and read as whole
+columns:
 
     array = layout.pack(stamp_ns, columns)      # array.tobytes() is n messages of array.itemsize bytes
     stamp_ns, columns = layout.unpack(array)    # law: gives back what was packed, bit for bit
 
 Columns are named by the path of the field, joined with underscores; three (four) float64 called x, y, z (, w)
-that make up a whole nested message are one column of shape (3,) or (4,). The header is not a column: its stamp
-is the message's stamp and its frame_id one of the strings.
+that make up a whole nested message are one column of shape (3,) or (4,). The header is not a column: its
+stamp is the message's stamp and its frame_id one of the strings.
 """
 
 from __future__ import annotations
