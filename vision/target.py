@@ -137,7 +137,7 @@ class RingTarget:
     def to_toml(self) -> str:
         """Return the text of a ``target.toml``. Law: ``RingTarget.from_toml(t.to_toml()) == t``."""
         return (
-            "# Concentric red rings on white. edges_m: radii of the edges from the outside in; red lies from\n"
+            "# Concentric red rings on white. edges_m: radii of the edges from the outside in; red is from\n"
             "# the 1st to the 2nd, the 3rd to the 4th, ... Measure the print and correct them: an error of\n"
             "# 1 % here is an error of 1 % in every distance.\n"
             f"name = {msgspec.json.encode(self.name).decode()}\n"
