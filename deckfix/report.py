@@ -1,0 +1,380 @@
+"""The report: one self-contained HTML page, without network, that opens on any machine and any phone.
+
+All text from a log is escaped: in the page as HTML, in the figures' data by writing ``<``, ``>`` and ``&`` as JSON
+escapes, and a content security policy lets only the page's own two scripts run and nothing be fetched.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+from collections.abc import Iterable, Sequence
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from deckfix import figures
+from deckfix._version import __version__
+from deckfix.findings import Finding, Severity, findings, verdict
+from deckfix.plotting import Figure
+from deckfix.reference import RATIOS
+from deckfix.result import Result
+from estimation.outcome import Outcome
+
+MOST_SENSORS = 12
+"""So many sensors get plots of their innovations; the tables name all."""
+
+_WORDS = {Severity.SERIOUS: "serious", Severity.WARNING: "warning", Severity.NOTE: "note"}
+
+
+def render(result: Result) -> str:
+    """Return the report of a result as HTML."""
+    found = findings(result)
+    plots = _Plots()
+    sections = [
+        ("wrong", "What went wrong", _wrong(found)),
+        ("track", "Track", _track(result, plots)),
+        ("estimate", "Estimate", _estimate(result, plots)),
+        ("measurements", "Measurements", _measurements(result, plots)),
+        ("outcomes", "Outcomes", _outcomes(result, plots)),
+        ("states", "Biases", _states(result, plots)),
+        ("inputs", "Rates and gaps", _inputs(result, plots)),
+        ("configuration", "Configuration", _configuration(result)),
+    ]
+    body = "".join(
+        f'<section id="{key}"><h2>{title}</h2>{content}</section>' for key, title, content in sections if content
+    )
+    links = "".join(f'<a href="#{key}">{title}</a>' for key, title, content in sections if content)
+    return _page(result, _header(result, found), links, body, plots)
+
+
+def text(value: object) -> str:
+    """Return text for HTML: escaped, control characters (other than line breaks) made visible."""
+    clean = "".join(
+        c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in str(value)
+    )
+    return html.escape(clean)
+
+
+def embedded_json(value: Any) -> str:
+    """Return JSON that may stand inside a ``<script>``: no ``<``, ``>``, ``&`` or line separators in it.
+
+    NumPy arrays of float32 become plotly's typed arrays; other numbers that are not finite become null.
+    """
+    out = json.dumps(_plain(value), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return out.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        data = np.ascontiguousarray(value, dtype="<f4")
+        return {"dtype": "f4", "bdata": base64.b64encode(data.tobytes()).decode("ascii")}
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+class _Plots:
+    """The figures of a page: places in the body, data at its end."""
+
+    def __init__(self) -> None:
+        self.data: list[str] = []
+
+    def place(self, figure: Figure, description: str) -> str:
+        """Return the place of a figure, described in words for those who do not see it."""
+        name = f"plot{len(self.data) + 1}"
+        self.data.append(f'<script type="application/json" id="data-{name}">{embedded_json(figure)}</script>')
+        height = int(figure["layout"]["height"])
+        return (
+            f'<div class="plot" id="{name}" role="img" aria-label="{text(description)}" '
+            f'style="min-height:{height}px"></div>'
+        )
+
+
+def _page(result: Result, header: str, links: str, body: str, plots: _Plots) -> str:
+    from plotly.offline import get_plotlyjs
+
+    assets = resources.files("deckfix")
+    style = (assets / "report.css").read_text(encoding="utf-8")
+    own = (assets / "report.js").read_text(encoding="utf-8")
+    library = get_plotlyjs()
+    allowed = " ".join(f"'sha256-{_sha256(script)}'" for script in (library, own))
+    policy = (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data: blob:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<meta name="generator" content="deckfix {__version__}">'
+        f"<title>{text(result.flight)} - deckfix</title><style>{style}</style></head><body>"
+        f'<nav><div><b>deckfix</b>{links}</div></nav><main>{header}'
+        "<noscript><p>The plots need JavaScript; the tables do not.</p></noscript>"
+        f"{body}<footer>Written by deckfix {__version__}. This page is complete in itself: it loads nothing "
+        "and sends nothing.</footer></main>"
+        f"{''.join(plots.data)}<script>{library}</script><script>{own}</script></body></html>\n"
+    )
+
+
+def _sha256(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+
+
+def _header(result: Result, found: list[Finding]) -> str:
+    worst = max((f.severity for f in found), default=Severity.NOTE)
+    if not len(result.run.t_ns):
+        worst = Severity.SERIOUS
+    cells = [("duration", _duration(result.duration_s)), ("estimates", f"{len(result.run.t_ns):,}")]
+    records = result.run.records
+    if len(records):
+        share = np.mean(records["outcome"] <= int(Outcome.DOWNWEIGHTED))
+        cells.append(("measurements fused", f"{100 * share:.1f} % <small>of {len(records):,}</small>"))
+    cells += _accuracy(result)
+    engine = text(result.run.engine)
+    speed = result.duration_s / result.wall_s if result.wall_s > 0 else 0.0
+    cells.append(("engine", f"{engine} <small>{speed:.0f}x real time</small>" if speed >= 1 else engine))
+    facts = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in cells)
+    return (
+        f'<header><p class="eyebrow">Flight report</p><h1>{text(result.flight)}</h1>'
+        f'<p class="verdict {_WORDS[worst]}">{text(verdict(result, found))}</p>'
+        f'<dl class="figures">{facts}</dl></header>'
+    )
+
+
+def _accuracy(result: Result) -> list[tuple[str, str]]:
+    if result.truth_errors is not None:
+        inside = result.judged.inside(result.truth_errors.t_ns)
+        out = []
+        for name, values, unit, axes in (
+            ("horizontal error, rms", result.truth_errors.position_m, "m", (0, 1)),
+            ("height error, rms", result.truth_errors.position_m, "m", (2,)),
+            ("tilt error, rms", np.rad2deg(result.truth_errors.attitude_rad), "deg", (0, 1)),
+        ):
+            part = values[inside][:, axes]
+            part = part[np.isfinite(part).all(axis=1)]
+            if len(part):
+                rms = float(np.sqrt(np.mean(np.sum(part**2, axis=1))))
+                out.append((name, f"{rms:.3f} {unit}"))
+        return out
+    if not len(result.run.t_ns):
+        return []
+    variance = np.median(np.einsum("nii->ni", result.run.covariance), axis=0).clip(0.0)
+    horizontal, vertical = float(np.sqrt(variance[0] + variance[1])), float(np.sqrt(variance[2]))
+    return [
+        ("horizontal sigma, median", f"{horizontal:.2f} m"),
+        ("height sigma, median", f"{vertical:.2f} m"),
+    ]
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
+
+
+def _wrong(found: list[Finding]) -> str:
+    if not found:
+        return (
+            '<p class="clear">Nothing was found. No measurement was rejected to a noticeable degree, no gap, no '
+            "inconsistent innovation, no implausible bias.</p>"
+        )
+    heads = ("", "symptom", "likely cause", "what to do")
+    rows = [
+        (_WORDS[f.severity], [_WORDS[f.severity], text(f.symptom), text(f.cause), text(f.remedy)]) for f in found
+    ]
+    return _table(heads, rows, css="findings")
+
+
+def _track(result: Result, plots: _Plots) -> str:
+    if not len(result.run.t_ns):
+        return ""
+    about = "Positions are relative to the origin below; references are shifted by their constant offset."
+    lat, lon, alt = (float(v) for v in result.run.origin)
+    return (
+        f'<p class="lead">{about} Origin: {np.rad2deg(lat):.6f}°, {np.rad2deg(lon):.6f}°, {alt:.1f} m.</p>'
+        '<div class="pair">'
+        f"<div>{plots.place(figures.track(result), 'Track on the level plane')}</div>"
+        f"<div>{plots.place(figures.height(result), 'Height over time')}</div></div>"
+    )
+
+
+def _estimate(result: Result, plots: _Plots) -> str:
+    if not len(result.run.t_ns):
+        return ""
+    if result.truth_errors is not None:
+        about = (
+            "Errors against the truth in the log. An honest filter stays inside its ±3 sigma band nearly always, and "
+            "is not far inside it. The position is less its constant offset."
+        )
+    else:
+        about = "The log holds no truth, so the estimates themselves are shown, with their ±3 sigma band."
+    out = [f'<p class="lead">{about}</p>', _ratio_table(result)]
+    for title, draw in (
+        ("Position", figures.position),
+        ("Velocity", figures.velocity),
+        ("Attitude", figures.attitude),
+    ):
+        out.append(f"<h3>{title}</h3>{plots.place(draw(result), f'{title} over time')}")
+    return "".join(out)
+
+
+def _ratio_table(result: Result) -> str:
+    if result.at_autopilot is None:
+        return ""
+    from deckfix.reference import rms
+
+    ratios = result.summary()["ratio"]
+    ours, theirs = result.at_autopilot.ours, result.at_autopilot.autopilot
+    inside = result.judged.inside(ours.t_ns)
+    rows = []
+    for name, quantity, axes in RATIOS:
+        if name not in ratios:
+            continue
+        factor, unit = {"position_m": (1.0, "m"), "velocity_mps": (1.0, "m/s")}.get(quantity, (180 / np.pi, "deg"))
+        size = np.sqrt(len(axes))
+        both = [(rms(getattr(e, quantity)[inside][:, axes]) or 0.0) * factor * size for e in (ours, theirs)]
+        cells = [name.replace("_", " "), f"{both[0]:.3f} {unit}", f"{both[1]:.3f} {unit}", f"{ratios[name]:.2f}"]
+        rows.append(("", cells))
+    if not rows:
+        return ""
+    start, end = (result.seconds(v) for v in (result.judged.start_ns, result.judged.end_ns))
+    return (
+        _table(("rms error", "deckfix", "autopilot's own", "ratio"), rows, numeric=(1, 2, 3))
+        + f'<p class="lead">Between {start:.1f} s and {end:.1f} s'
+        + (", contact less half a second" if result.judged.contact_ns is not None else "")
+        + ".</p>"
+    )
+
+
+def _measurements(result: Result, plots: _Plots) -> str:
+    shown = [n for n in result.measured if (s := result.nis(n)) is not None and s.count > 1]
+    if not shown:
+        return ""
+    rows = []
+    for name in shown:
+        s = result.nis(name)
+        assert s is not None
+        doubtful = s.count >= 30 and not 0.2 <= s.mean_over_dof <= 2.0
+        mean = f'<span class="off">{s.mean_over_dof:.2f}</span>' if doubtful else f"{s.mean_over_dof:.2f}"
+        rows.append(("", [text(name), f"{s.count:,}", mean, f"{100 * s.inside_95:.0f} %"]))
+    out = [
+        '<p class="lead">An innovation is a measurement less its prediction. Its normalised square, the NIS, averages '
+        "to one per degree of freedom when noise and latency are right, and lies in the green band 95 % of the "
+        "time.</p>",
+        _table(("sensor", "innovations", "NIS / dof", "inside 95 % band"), rows, numeric=(1, 2, 3)),
+    ]
+    for name in shown[:MOST_SENSORS]:
+        figure = figures.innovations(result, name)
+        out.append(f"<h3>{text(name)}</h3>{plots.place(figure, f'Innovations and NIS of {name}')}")
+    if len(shown) > MOST_SENSORS:
+        out.append(f"<p>{len(shown) - MOST_SENSORS} further sensors are in the table only.</p>")
+    return "".join(out)
+
+
+def _outcomes(result: Result, plots: _Plots) -> str:
+    if not len(result.run.records):
+        return ""
+    counts = {name: result.outcomes(name) for name in result.measured}
+    used = [o for o in Outcome if any(o in c for c in counts.values())]
+    heads = ("sensor", *(o.name.lower().replace("_", " ") for o in used))
+    rows = [("", [text(n), *(f"{c[o]:,}" if o in c else "" for o in used)]) for n, c in counts.items()]
+    return (
+        '<p class="lead">Every measurement ends in exactly one outcome.</p>'
+        + plots.place(figures.outcomes(result), "Outcomes over time")
+        + _table(heads, rows, numeric=tuple(range(1, len(heads))))
+    )
+
+
+def _states(result: Result, plots: _Plots) -> str:
+    if not len(result.run.t_ns):
+        return ""
+    known = {
+        "gyro_bias": "Gyro bias",
+        "accel_bias": "Accelerometer bias",
+        "gps_bias": "GPS position bias",
+        "baro_bias": "Barometer offset",
+    }
+    blocks = list(dict.fromkeys(n.split(".")[0] for n in result.run.state_names))
+    blocks = [b for b in blocks if b not in ("position", "velocity", "attitude")]
+    out = ['<p class="lead">Slow errors of the sensors that the filter estimates along with the motion.</p>']
+    for block in blocks:
+        title = known.get(block, block.replace("_", " ").capitalize())
+        out.append(f"<h3>{text(title)}</h3>{plots.place(figures.states(result, block), title)}")
+    return "".join(out) if blocks else ""
+
+
+def _inputs(result: Result, plots: _Plots) -> str:
+    if not result.streams:
+        return ""
+    rows = []
+    for s in result.streams:
+        start = f"{s.longest_gap_s:.2f} s" if s.gaps else ""
+        cells = [text(s.name), s.kind.name.lower().replace("_", " "), f"{s.count:,}", f"{s.rate_hz:.1f} Hz"]
+        rows.append(("", [*cells, str(len(s.gaps)), start]))
+    heads = ("sensor", "kind", "messages", "rate", "gaps", "longest gap")
+    about = "A gap is an interval of more than five times the usual one."
+    clock = ""
+    if result.clocks:
+        entries = [
+            ("", [text(name), *(text(_number(v)) for v in values.values())]) for name, values in result.clocks.items()
+        ]
+        names = list(next(iter(result.clocks.values())))
+        clock = "<h3>Clocks</h3>" + _table(("clock", *(text(n.replace("_", " ")) for n in names)), entries)
+    return (
+        f'<p class="lead">{about}</p>'
+        + plots.place(figures.coverage(result), "When each sensor spoke")
+        + _table(heads, rows, numeric=(2, 3, 4, 5))
+        + clock
+    )
+
+
+def _number(value: object) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _configuration(result: Result) -> str:
+    out = [
+        f'<p class="lead">Used: {text(result.config_source)}.</p>',
+        f"<details><summary>All parameters</summary><pre>{text(result.config_text)}</pre></details>",
+    ]
+    for name, entries in sorted(result.metadata.items()):
+        if not entries:
+            continue
+        lines = "\n".join(f"{key} = {_shorten(value)}" for key, value in sorted(entries.items()))
+        out.append(f"<details><summary>From the log: {text(name)}</summary><pre>{text(lines[:60_000])}</pre></details>")
+    if result.messages:
+        said = "\n".join(
+            f"{result.seconds(m.t_ns):9.2f} s  {m.source}: {_shorten(m.text)}" for m in result.messages[:2000]
+        )
+        out.append(f"<details><summary>Messages in the log</summary><pre>{text(said)}</pre></details>")
+    return "".join(out)
+
+
+def _shorten(value: str, longest: int = 2000) -> str:
+    return value if len(value) <= longest else value[:longest] + " …"
+
+
+def _table(
+    heads: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]], *, numeric: tuple[int, ...] = (), css: str = ""
+) -> str:
+    """Return a table of cells that are HTML already; each row comes with its CSS class."""
+
+    def cell(tag: str, i: int, content: str) -> str:
+        right = ' class="n"' if i in numeric else ""
+        head = f' data-head="{text(heads[i])}"' if tag == "td" else ""
+        return f"<{tag}{right}{head}>{content}</{tag}>"
+
+    head = "".join(cell("th", i, h) for i, h in enumerate(heads))
+    body = "".join(
+        f'<tr class="{kind}">{"".join(cell("td", i, c) for i, c in enumerate(cells))}</tr>' for kind, cells in rows
+    )
+    return f'<div class="scroll"><table class="{css}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'

@@ -1,0 +1,214 @@
+"""The result of a replay: estimates, what became of each measurement, and how both compare with references."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deckfix.reference import Errors, Trajectory, Window, ratio_block, rmse_block
+from deckfix.streams import Stream
+from estimation.frames import quat_to_euler_columns
+from estimation.outcome import Outcome
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import plotly.graph_objects as go
+
+    from estimation.estimator import Run
+    from logs.recording import Recording
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class LogMessage:
+    """A line of text from the log: ``t_ns`` on the inertial clock, level as in rcl_interfaces/msg/Log."""
+
+    t_ns: int
+    level: int
+    source: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class NisStatistics:
+    """Of one sensor's ``count`` normalised innovations squared: mean over their degrees of freedom (1 when the
+    filter is honest), and the share inside their two-sided 95 % band (0.95 when it is).
+    """
+
+    count: int
+    mean_over_dof: float
+    inside_95: float
+
+
+@dataclass(slots=True)
+class AtReference:
+    """Both estimates less the truth at the times of the autopilot's own estimate, for the ratio of the two."""
+
+    ours: Errors
+    autopilot: Errors
+
+
+@dataclass
+class Result:
+    """Everything that a replay gave.
+
+    ``run`` holds the estimates and the measurements' records; ``t_s`` are seconds from ``start_ns``, the first
+    inertial sample. ``truth_errors`` are at the estimates' times; ``at_autopilot`` at the autopilot's; both are
+    None where the log holds no such reference. ``sensors`` are the input as it was recorded, for ``write``.
+    """
+
+    flight: str
+    run: Run
+    streams: tuple[Stream, ...]
+    start_ns: int
+    end_ns: int
+    judged: Window
+    config_text: str
+    config_source: str
+    wall_s: float = 0.0
+    truth: Trajectory | None = None
+    autopilot: Trajectory | None = None
+    truth_errors: Errors | None = None
+    at_autopilot: AtReference | None = None
+    clocks: dict[str, dict[str, Any]] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+    messages: tuple[LogMessage, ...] = ()
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    vibration_mps2: float | None = None
+    sensors: Recording | None = None
+
+    @cached_property
+    def t_s(self) -> Array:
+        """Times of the estimates [s] from the first inertial sample, shape (n,)."""
+        return (self.run.t_ns - self.start_ns) * 1e-9
+
+    @cached_property
+    def euler_rad(self) -> Array:
+        """Roll, pitch, yaw [rad] of the estimates, shape (n, 3)."""
+        return quat_to_euler_columns(self.run.quaternion)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last inertial sample [s]."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    def seconds(self, t_ns: int) -> float:
+        """Return a time on the inertial clock as seconds from the first inertial sample."""
+        return (t_ns - self.start_ns) * 1e-9
+
+    def sensor_records(self, name: str) -> NDArray[np.void]:
+        """Return the records of one sensor's measurements."""
+        return self.run.records[self.run.records["sensor"] == self.run.sensors.index(name)]
+
+    @cached_property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the sensors that have records, in the estimator's order."""
+        present = set(np.unique(self.run.records["sensor"]).tolist())
+        return tuple(name for i, name in enumerate(self.run.sensors) if i in present)
+
+    def outcomes(self, name: str) -> dict[Outcome, int]:
+        """Return how often each outcome befell a sensor's measurements; those that never did are left out."""
+        values, counts = np.unique(self.sensor_records(name)["outcome"], return_counts=True)
+        return {Outcome(int(v)): int(c) for v, c in zip(values, counts, strict=True)}
+
+    def nis(self, name: str) -> NisStatistics | None:
+        """Return the consistency of one sensor's innovations; None where none was formed."""
+        records = self.sensor_records(name)
+        records = records[np.isfinite(records["nis"]) & (records["dof"] > 0)]
+        if not len(records):
+            return None
+        dof = records["dof"].astype(np.float64)
+        low, high = nis_band(dof)
+        inside = (records["nis"] >= low) & (records["nis"] <= high)
+        return NisStatistics(len(records), float(np.mean(records["nis"] / dof)), float(np.mean(inside)))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the summary that ``deckfix replay --json`` writes (docs/json.md); what is absent is left out."""
+        out: dict[str, Any] = {
+            "flight": self.flight,
+            "duration_s": self.duration_s,
+            "engine": self.run.engine,
+            "wall_s": self.wall_s,
+            "events": {
+                s.name: {"count": s.count, "rate_hz": s.rate_hz, "gaps": len(s.gaps)} for s in self.streams
+            },
+            "fusion": {n: {o.name: c for o, c in self.outcomes(n).items()} for n in self.measured},
+            "nis": {
+                n: {"mean_over_dof": s.mean_over_dof, "inside_95": s.inside_95}
+                for n in self.measured
+                if (s := self.nis(n)) is not None
+            },
+        }
+        if self.truth_errors is not None:
+            out["truth"] = {"odometry": rmse_block(self.truth_errors, self.judged)}
+        if self.at_autopilot is not None:
+            ours, theirs = self.at_autopilot.ours, self.at_autopilot.autopilot
+            out["autopilot"] = rmse_block(theirs, self.judged)
+            out["ratio"] = ratio_block(ours, theirs, self.judged) | {
+                "window_s": [self.seconds(self.judged.start_ns), self.seconds(self.judged.end_ns)]
+            }
+            if self.judged.contact_ns is not None:
+                out["ratio"]["contact_s"] = self.seconds(self.judged.contact_ns)
+        if self.clocks:
+            out["clock"] = self.clocks
+        return out
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the estimates as a table: one row each, indexed by seconds, with every state and its sigma.
+
+        Raises ``ImportError`` with the remedy where pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise ImportError("to_pandas() needs pandas; install it with: pip install pandas") from None
+        columns: dict[str, Any] = {"t_ns": self.run.t_ns}
+        for i, axis in enumerate("ned"):
+            columns[f"position_{axis}_m"] = self.run.position_m[:, i]
+        for i, axis in enumerate("ned"):
+            columns[f"velocity_{axis}_mps"] = self.run.velocity_mps[:, i]
+        for i, angle in enumerate(("roll", "pitch", "yaw")):
+            columns[f"{angle}_rad"] = self.euler_rad[:, i]
+        for i, part in enumerate("wxyz"):
+            columns[f"quaternion_{part}"] = self.run.quaternion[:, i]
+        for i, name in enumerate(self.run.state_names):
+            columns[f"state {name}"] = self.run.state_values[:, i]
+            columns[f"sigma {name}"] = self.run.state_sigmas[:, i]
+        return pandas.DataFrame(columns, index=pandas.Index(self.t_s, name="t_s"))
+
+    def figure(self) -> go.Figure:
+        """Return the track, the height and the errors as one plotly figure."""
+        import plotly.graph_objects as go
+
+        from deckfix.figures import overview
+
+        return go.Figure(overview(self))
+
+    def report(self) -> str:
+        """Return the report as one self-contained HTML page."""
+        from deckfix.report import render
+
+        return render(self)
+
+    def write(self, path: str | Path, *, force: bool = False, inputs: Sequence[str | Path] = ()) -> None:
+        """Write the sensors as they were recorded and the estimates to an MCAP file; same bytes each time.
+
+        Raises ``deckfix.files.OutputError`` where the file may not be written.
+        """
+        from deckfix.estimate_log import write
+
+        write(self, path, force=force, inputs=inputs)
+
+
+def nis_band(dof: Array) -> tuple[Array, Array]:
+    """Return the bounds between which 95 % of chi-square values with these degrees of freedom lie."""
+    from scipy.special import gammaincinv
+
+    return 2.0 * gammaincinv(dof / 2.0, 0.025), 2.0 * gammaincinv(dof / 2.0, 0.975)
