@@ -149,14 +149,14 @@ def ratio_table(t1: float = 1.3, floor: int = 4) -> Image:
     if not 0 <= floor <= 255:
         raise ValueError(f"floor: {floor!r} is not from 0 to 255")
     levels = np.floor(t1 * np.arange(256) + 1e-9) + floor
-    return np.minimum(levels, 255.0).astype(np.uint8)
+    return np.asarray(np.minimum(levels, 255.0), dtype=np.uint8)
 
 
 def sum_table(t2: float = 0.71) -> Image:
     """Return the table with ``R > table[G + B]`` as condition (4.2), shape (511,)."""
     if not (math.isfinite(t2) and t2 > 0.0):
         raise ValueError(f"t2: {t2!r} is not a positive factor")
-    return np.minimum(np.floor(t2 * np.arange(511) + 1e-9), 255.0).astype(np.uint8)
+    return np.asarray(np.minimum(np.floor(t2 * np.arange(511) + 1e-9), 255.0), dtype=np.uint8)
 
 
 def red_mask(image_bgr: Image, ratio: Image | None = None, total: Image | None = None) -> Image:
