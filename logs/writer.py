@@ -23,11 +23,12 @@ from logs.container import INDEX_ENTRY, MESSAGE_HEADER, Container
 from logs.definition import parse
 from logs.encode import encode
 from logs.errors import LogError
-from logs.events import series_of_event
+from logs.events import FOREIGN, series_of_event
 from logs.recording import Recording, Series
 from logs.topics import TOPICS, definition_text
 
 CLOCKS = "deckfix.clocks"
+PROBLEMS = "deckfix.problems"
 LIBRARY = "deckfix"
 _SECOND_NS = 1_000_000_000
 _CHUNK_BYTES = 1 << 20
@@ -123,8 +124,8 @@ class FlightWriter:
         for name, (media_type, data) in recording.attachments.items():
             self.add_attachment(name, media_type, data)
         if recording.problems:
-            problems = {str(i): text for i, text in enumerate(recording.problems)}
-            self.add_metadata("deckfix.problems", problems)
+            problems = {f"{i:04d}": text for i, text in enumerate(recording.problems)}
+            self.add_metadata(PROBLEMS, problems)
         self.write_series(*recording.series)
 
     def write_series(self, *series: Series) -> None:
@@ -186,7 +187,7 @@ class FlightWriter:
             raise LogError(self.path, f"topic {topic!r} has no message type", "name its message_type")
         stamp = arrival_ns if stamp_ns is None else stamp_ns
         offset = self._offset(clock, stamp, arrival_ns)
-        channel = self._channel(topic, kind, {"clock": clock, **(metadata or {})})
+        channel = self._channel(topic, kind, self._clocked(clock, metadata or {}))
         if isinstance(message, bytes | bytearray | memoryview):
             data = bytes(message)
         else:
@@ -301,7 +302,7 @@ class FlightWriter:
                     self.path, f"{series.topic}: {error}", "see logs.topics for the columns"
                 ) from None
             self._layouts[key] = built
-        channel = self._channel(series.topic, kind, {"clock": series.clock, **metadata}, text)
+        channel = self._channel(series.topic, kind, self._clocked(series.clock, metadata), text)
         return channel, self._layouts[key]
 
     def _channel(self, topic: str, kind: str, metadata: Mapping[str, str], text: str | None = None) -> int:
@@ -310,6 +311,12 @@ class FlightWriter:
         except KeyError:
             raise LogError(self.path, f"message type {kind!r} is unknown", "give its definition") from None
         return self.open_channel(topic, "cdr", (kind, "ros2msg", definition.encode()), metadata)
+
+    def _clocked(self, clock: str, metadata: Mapping[str, str]) -> dict[str, str]:
+        """Name the clock and its constant, which a damaged file may hold nowhere else."""
+        if metadata.get("source") == FOREIGN:
+            return dict(metadata)
+        return {"clock": clock, "clock_offset_ns": str(self._offsets[clock]), **metadata}
 
     def _offset(self, clock: str, stamp_ns: int, arrival_ns: int) -> int:
         if clock not in self._offsets:
