@@ -19,7 +19,7 @@ from logs.ardupilot_tables import Table, TimedTables, has
 from logs.dataflash import is_dataflash, read_dataflash
 from logs.dataflash_format import DataflashLog, text_of
 from logs.dataflash_text import read_dataflash_text
-from logs.datum import ardupilot_origin, ardupilot_scales
+from logs.datum import ardupilot_origin, ardupilot_scales, describe_origin
 from logs.recording import Recording, Series
 from logs.sensors import (
     ERROR,
@@ -305,7 +305,8 @@ def _origins(tables: TimedTables, undulation: float | None) -> dict[str, str]:
     origin = tables.rows("ORGN", "Type", "Lat", "Lng", "Alt")
     for kind, name in ((0, "autopilot_origin"), (1, "home")):
         if origin is not None and len(rows := origin[0][origin[0]["Type"] == kind]):
-            _add_point(entries, name, rows[0]["Lat"], rows[0]["Lng"], rows[0]["Alt"] + (undulation or 0.0))
+            point = (rows[0]["Lat"], rows[0]["Lng"], rows[0]["Alt"] + (undulation or 0.0))
+            entries |= describe_origin(name, point, ardupilot_scales(point[0]))
     place = tables.rows("SIM", "Lat", "Lng", "Alt")
     motion = tables.rows("SIM2", "PN", "PE", "PD")
     if place is not None and motion is not None:
@@ -314,19 +315,9 @@ def _origins(tables: TimedTables, undulation: float | None) -> dict[str, str]:
         there = columns(*(place[0][n][at] for n in ("Lat", "Lng", "Alt")))
         truth = ardupilot_origin(there, columns(moves["PN"], moves["PE"], moves["PD"]))
         if truth is not None:
-            _add_point(entries, "truth_origin", truth[0], truth[1], truth[2] + (undulation or 0.0))
+            truth = (truth[0], truth[1], truth[2] + (undulation or 0.0))
+            entries |= describe_origin("truth_origin", truth, ardupilot_scales(truth[0]))
     return entries
-
-
-def _add_point(
-    entries: dict[str, str], name: str, latitude: float, longitude: float, altitude: float
-) -> None:
-    north, east = ardupilot_scales(float(latitude))
-    entries[f"{name}_latitude_deg"] = repr(float(latitude))
-    entries[f"{name}_longitude_deg"] = repr(float(longitude))
-    entries[f"{name}_altitude_m"] = repr(float(altitude))
-    entries[f"{name}_north_scale"] = repr(north)
-    entries[f"{name}_east_scale"] = repr(east)
 
 
 def _vehicle(tables: TimedTables) -> str:

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from logs.chain import chain, gaps
 from logs.dataflash_format import CHARACTERS, DataflashLog, Format, make_format, no_formats, read_units
 from logs.errors import LogError
 
@@ -140,7 +141,7 @@ def _walk(
     if len(at) == 0:
         return at, which.astype(np.uint16), layouts
     ends = at + np.array([layout.length for layout in layouts], dtype=np.int64)[which]
-    keep = _chain(at, ends, len(data))
+    keep = chain(at, ends, len(data))
     _tell_losses(data, at[keep], ends[keep], set(definitions), log)
     own = at[keep & (data[at + 2] == _FMT_TYPE)].tolist()
     damaged = sum(_parse_format(data[k : k + _FMT_LENGTH].tobytes()) is None for k in own)
@@ -151,45 +152,6 @@ def _walk(
     return at[keep], which[keep].astype(np.uint16), layouts
 
 
-def _chain(at: NDArray[np.int64], ends: NDArray[np.int64], size: int) -> NDArray[np.bool_]:
-    """Return which candidates are messages; ``at`` ascending, ``ends`` where each would end."""
-    count = len(at)
-    keep = np.ones(count, dtype=np.bool_)
-    simple = np.zeros(count, dtype=np.bool_)
-    simple[:-1] = ends[:-1] == at[1:]
-    breaks = np.flatnonzero(~simple)
-    successor = np.searchsorted(at, ends[breaks])
-    reaches = successor < count
-    linked = simple.copy()
-    linked[breaks] = (ends[breaks] == size) | (
-        reaches & (at[np.minimum(successor, count - 1)] == ends[breaks])
-    )
-    # The first linked candidate at or after each break's next one: where to go on after damage.
-    resume_table = np.flatnonzero(linked)
-    found = np.searchsorted(resume_table, breaks + 1)
-    resume = np.append(resume_table, count)[found]
-    here = 0
-    for b, s, r, good, end in zip(
-        breaks.tolist(),
-        successor.tolist(),
-        resume.tolist(),
-        linked[breaks].tolist(),
-        ends[breaks].tolist(),
-        strict=True,
-    ):
-        if b < here:
-            continue
-        if good:
-            here = s
-        elif end > size or (r < count and at[r] < end):
-            keep[b] = False
-            here = r
-        else:
-            here = r
-        keep[b + 1 : here] = False
-    return keep
-
-
 def _tell_losses(
     data: NDArray[np.uint8],
     at: NDArray[np.int64],
@@ -198,22 +160,20 @@ def _tell_losses(
     log: DataflashLog,
 ) -> None:
     """Add to the problems what lies between the messages."""
-    starts = np.concatenate([[0], ends])
-    stops = np.concatenate([at, [len(data)]])
-    gaps = np.flatnonzero(stops > starts)
-    if len(gaps) == 0:
+    starts, stops = gaps(at, ends, len(data))
+    if len(starts) == 0:
         return
     unknown: Counter[int] = Counter()
-    for g in gaps[:10000].tolist():
-        head = data[starts[g] : starts[g] + 3].tobytes()
+    for start in starts[:10000].tolist():
+        head = data[start : start + 3].tobytes()
         if head.startswith(_HEADER) and len(head) == 3 and head[2] not in known:
             unknown[head[2]] += 1
-    lost = int((stops[gaps] - starts[gaps]).sum())
-    if len(gaps) == 1 and gaps[0] == len(at):
+    lost = int((stops - starts).sum())
+    if len(starts) == 1 and stops[0] == len(data):
         log.problems.append(f"the log ends within a message, whose {lost} bytes are lost")
     else:
         log.problems.append(
-            f"{lost} bytes in {len(gaps)} places are not readable messages and were passed over"
+            f"{lost} bytes in {len(starts)} places are not readable messages and were passed over"
         )
     if unknown:
         kinds = ", ".join(str(k) for k, _ in unknown.most_common(8))

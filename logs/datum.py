@@ -48,3 +48,25 @@ def ardupilot_origin(
         return None
     middle = np.median(points, axis=0)
     return float(middle[0]), float(middle[1]), float(middle[2])
+
+
+def ardupilot_positions(
+    places: NDArray[np.float64], origin: tuple[float, float, float]
+) -> NDArray[np.float64]:
+    """Return local NED positions (n, 3) [m], by ArduPilot's sphere, of places (n, 3) [deg, deg, m].
+
+    Law: inverse of ``ardupilot_origin``: the origin of these positions and places is ``origin``.
+    """
+    latitude, longitude, altitude = places.T
+    north = (latitude - origin[0]) * _DEGREE_M
+    east = (longitude - origin[1]) * _DEGREE_M * np.cos(np.radians(0.5 * (latitude + origin[0])))
+    return np.stack([north, east, origin[2] - altitude], axis=1)
+
+
+def describe_origin(
+    name: str, point: tuple[float, float, float], scales: tuple[float, float] = (1.0, 1.0)
+) -> dict[str, str]:
+    """Return an origin as metadata: latitude, longitude [deg], altitude [m], factors north and east."""
+    values = dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), point, strict=True))
+    values |= {"north_scale": scales[0], "east_scale": scales[1]}
+    return {f"{name}_{key}": repr(float(value)) for key, value in values.items()}

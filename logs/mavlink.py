@@ -1,0 +1,353 @@
+"""What a MAVLink telemetry log means: the autopilot's sensors and estimate, and what its companion said.
+
+Arrivals are the recorder's (UTC). Stamps are the autopilot's, since boot; a message that carries none is
+stamped with its arrival on the autopilot's clock (metadata ``stamp``). Only one vehicle and one of its boots
+is imported.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from logs.ardupilot import filter_delay
+from logs.companion import read_companion
+from logs.dataflash_format import text_of
+from logs.datum import ardupilot_positions, ardupilot_scales, describe_origin
+from logs.recording import Recording, Series
+from logs.sensors import (
+    DEBUG,
+    ERROR,
+    FATAL,
+    FIX,
+    INFO,
+    NO_FIX,
+    NOT_MEASURED,
+    RTK_FIXED,
+    RTK_FLOAT,
+    WARN,
+    Floats,
+    attitude_series,
+    barometer_series,
+    columns,
+    fix_series,
+    imu_series,
+    log_series,
+    magnetometer_series,
+    odometry_series,
+    quaternions_from_euler,
+    range_series,
+    velocity_series,
+)
+from logs.tlog import read_telemetry
+from logs.vehicles import IMU_MESSAGES, Autopilot, find_autopilot
+
+_STANDARD_GRAVITY = 9.80665
+_DOWNWARD = 25
+_ARDUPILOT = 3
+_UNKNOWN_COURSE = 65535
+_SPEED_SIGMA_MPS = 0.5
+_STATUS = np.array([NO_FIX, NO_FIX, NO_FIX, FIX, FIX, RTK_FLOAT, RTK_FIXED, FIX, FIX], dtype=np.int8)
+_LEVELS = (FATAL, FATAL, FATAL, ERROR, WARN, INFO, INFO, DEBUG)
+_HANDLED = {"HEARTBEAT", "PARAM_VALUE", "SYSTEM_TIME", "GPS_GLOBAL_ORIGIN", "HOME_POSITION"}
+
+
+def import_telemetry(path: Path, system: int | None = None) -> Recording:
+    """Read a .tlog file; of several vehicles the one with most IMU data, or that with the id ``system``.
+
+    Raises LogError when no frame can be read or no autopilot speaks in it. What was damaged or left out is in
+    the recording's ``problems``.
+    """
+    log = read_telemetry(path)
+    autopilot = find_autopilot(log, path, system)
+    out = Recording()
+    ardupilot = _is_ardupilot(autopilot)
+    parameters = _parameters(autopilot)
+    undulation = _undulation(autopilot)
+    out.series += _imu(autopilot, ardupilot, filter_delay(parameters) if ardupilot else {})
+    out.series += _gps(autopilot, undulation) + _air(autopilot) + _range(autopilot)
+    origins, origin = _origins(autopilot, ardupilot, undulation or 0.0)
+    if undulation is not None:
+        origins |= {"altitude_datum": "ellipsoid", "undulation_m": repr(undulation)}
+    out.series += _own_estimate(autopilot, origin, undulation or 0.0)
+    out.series += _truth(autopilot, origins, undulation or 0.0)
+    companion = read_companion(autopilot)
+    out.series += companion.series + _texts(autopilot)
+    out.clock_offsets_ns["autopilot"] = autopilot.offset_ns
+    if companion.offset_ns is not None:
+        out.clock_offsets_ns["companion"] = companion.offset_ns
+    out.metadata["deckfix.origin"] = origins
+    out.metadata["deckfix.source"] = _source(autopilot, ardupilot)
+    if parameters:
+        text = json.dumps(parameters, indent=0, sort_keys=True).encode()
+        out.attachments["parameters.json"] = ("application/json", text)
+    out.problems += log.problems + companion.problems
+    if autopilot.left_out:
+        which = ", ".join(f"{n} {k}" for n, k in sorted(autopilot.left_out.items()))
+        out.problems.append(f"messages whose time was damaged or ran backwards were left out: {which}")
+    return out
+
+
+def _is_ardupilot(autopilot: Autopilot) -> bool:
+    beats = autopilot.messages("HEARTBEAT")
+    return bool(len(beats)) and int(np.median(beats.data["autopilot"])) == _ARDUPILOT
+
+
+def _parameters(autopilot: Autopilot) -> dict[str, float]:
+    data = autopilot.messages("PARAM_VALUE").data
+    names = [text_of(n) for n in data["param_id"].tolist()]
+    return dict(zip(names, data["param_value"].astype(np.float64).tolist(), strict=True))
+
+
+def _imu(autopilot: Autopilot, ardupilot: bool, delay: dict[str, str]) -> list[Series]:
+    """Return /imu from the best message there is, and what else of it only HIGHRES_IMU and its kin carry."""
+    for name in IMU_MESSAGES:
+        if name == "RAW_IMU" and not ardupilot:
+            continue  # elsewhere its numbers have no fixed unit
+        found = autopilot.timed(name)
+        if found is None:
+            continue
+        data, times = found
+        acceleration = columns(data["xacc"], data["yacc"], data["zacc"])
+        rate = columns(data["xgyro"], data["ygyro"], data["zgyro"])
+        field = columns(data["xmag"], data["ymag"], data["zmag"])
+        if name == "HIGHRES_IMU":
+            first = data["id"] == 0
+            data, times = data[first], times[first]
+            acceleration, rate, field = acceleration[first], rate[first], field[first] * _gauss(field[first])
+        else:
+            acceleration, rate, field = acceleration * 1e-3 * _STANDARD_GRAVITY, rate * 1e-3, field * 1e-7
+        if not len(times):
+            continue
+        made = [imu_series(times, rate, acceleration, 0, {"message": name, **delay})]
+        if np.any(field):
+            fresh = _changes(field)
+            made.append(magnetometer_series(times[fresh], field[fresh], 0, {"message": name}))
+        if (
+            name == "HIGHRES_IMU"
+            and autopilot.timed("SCALED_PRESSURE") is None
+            and data["abs_pressure"].any()
+        ):
+            pressure = 100.0 * data["abs_pressure"].astype(np.float64)
+            fresh = _changes(pressure[:, np.newaxis])
+            made += barometer_series(
+                times[fresh], pressure[fresh], data["temperature"][fresh], 0, {"message": name}
+            )
+        return made
+    return []
+
+
+def _gauss(field: Floats) -> float:
+    """Return the factor to tesla: gauss by the standard, but ArduPilot sends them times a power of 1000."""
+    strength = float(np.median(np.linalg.norm(field, axis=1)))
+    if not math.isfinite(strength) or strength < 10.0:
+        return 1e-4
+    return 1e-4 * 10.0 ** (-3 * round(math.log10(strength / 0.5) / 3))
+
+
+def _changes(values: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Return which rows (n, k) differ from the row before: a slow sensor's values are sent several times."""
+    fresh = np.ones(len(values), dtype=np.bool_)
+    fresh[1:] = np.any(values[1:] != values[:-1], axis=1)
+    return fresh
+
+
+def _undulation(autopilot: Autopilot) -> float | None:
+    """Return the geoid's height above the ellipsoid [m] that the receiver gave, or None."""
+    data = autopilot.messages("GPS_RAW_INT").data
+    data = data[(data["fix_type"] >= 3) & (data["alt_ellipsoid"] != 0)]
+    return (
+        1e-3 * float(np.median(data["alt_ellipsoid"] - data["alt"].astype(np.int64))) if len(data) else None
+    )
+
+
+def _gps(autopilot: Autopilot, undulation: float | None) -> list[Series]:
+    """Return /gps/fix and /gps/velocity, whose vertical part GPS_RAW_INT does not have (a huge variance)."""
+    found = autopilot.timed("GPS_RAW_INT")
+    if found is None:
+        return []
+    data, times = found
+    fresh = np.ones(len(times), dtype=np.bool_)
+    fresh[1:] = np.diff(times.stamp_ns) > 0
+    data, times = data[fresh], times[fresh]
+    status = _STATUS[np.minimum(data["fix_type"], len(_STATUS) - 1)]
+    altitude = 1e-3 * data["alt"] + (undulation or 0.0)
+    datum = "mean sea level" if undulation is None else "ellipsoid"
+    metadata = {"message": "GPS_RAW_INT", "altitude_datum": datum}
+    position = fix_series(
+        times,
+        1e-7 * data["lat"],
+        1e-7 * data["lon"],
+        altitude,
+        status,
+        1e-3 * data["h_acc"],
+        1e-3 * data["v_acc"],
+        0,
+        metadata,
+    )
+    course = np.radians(1e-2 * data["cog"])
+    speed = 1e-2 * data["vel"]
+    moving = (data["vel"] != _UNKNOWN_COURSE) & (data["cog"] != _UNKNOWN_COURSE) & (status != NO_FIX)
+    if not moving.any():
+        return [position]
+    sigma = 1e-3 * data["vel_acc"]
+    sigma = np.where(sigma > 0.0, sigma, _SPEED_SIGMA_MPS)[moving]
+    horizontal = columns(speed * np.cos(course), speed * np.sin(course), np.zeros(len(speed)))[moving]
+    metadata |= {
+        "vertical": "not measured: its variance is 1e6",
+        "sigma": f"vel_acc, {_SPEED_SIGMA_MPS} m/s where it is 0",
+    }
+    velocity = velocity_series(times[moving], horizontal, sigma, 0, metadata)
+    velocity.data["twist_covariance"][:, 14] = NOT_MEASURED
+    return [position, velocity]
+
+
+def _air(autopilot: Autopilot) -> list[Series]:
+    found = autopilot.timed("SCALED_PRESSURE")
+    if found is None:
+        return []
+    data, times = found
+    fresh = _changes(data["press_abs"][:, np.newaxis])
+    data, times = data[fresh], times[fresh]
+    pressure = 100.0 * data["press_abs"].astype(np.float64)
+    return barometer_series(times, pressure, 1e-2 * data["temperature"], 0, {"message": "SCALED_PRESSURE"})
+
+
+def _range(autopilot: Autopilot) -> list[Series]:
+    found = autopilot.timed("DISTANCE_SENSOR")
+    if found is None:
+        return []
+    data, times = found
+    down = data["orientation"] == _DOWNWARD
+    if not down.any():
+        return []
+    down &= data["id"] == data["id"][down][0]
+    data = data[down]
+    metres = [1e-2 * data[f"{n}_distance"] for n in ("current", "min", "max")]
+    kind = int(data["type"][0] == 0)
+    return [
+        range_series(times[down], metres[0], metres[1], metres[2], kind, 0, {"message": "DISTANCE_SENSOR"})
+    ]
+
+
+def _own_estimate(
+    autopilot: Autopilot, origin: tuple[float, float, float] | None, undulation: float
+) -> list[Series]:
+    """Return /attitude and /autopilot/odometry: what the autopilot itself believed."""
+    made = []
+    for name in ("ATTITUDE_QUATERNION", "ATTITUDE"):
+        found = autopilot.timed(name)
+        if found is None:
+            continue
+        data, times = found
+        if name == "ATTITUDE":
+            q = quaternions_from_euler(data["roll"], data["pitch"], data["yaw"])
+        else:
+            q = columns(*(data[f"q{k}"] for k in (1, 2, 3, 4)))
+        made.append(attitude_series(times, q, {"message": name}))
+        break
+    local = autopilot.timed("LOCAL_POSITION_NED")
+    if local is not None:
+        data, times = local
+        position = columns(data["x"], data["y"], data["z"])
+        velocity = columns(data["vx"], data["vy"], data["vz"])
+        metadata = {"message": "LOCAL_POSITION_NED", "origin": "autopilot_origin"}
+        made.append(odometry_series("/autopilot/odometry", times, position, velocity, None, metadata))
+        return made
+    placed = autopilot.timed("GLOBAL_POSITION_INT")
+    if placed is not None and origin is not None:
+        data, times = placed
+        position = ardupilot_positions(
+            columns(1e-7 * data["lat"], 1e-7 * data["lon"], 1e-3 * data["alt"] + undulation), origin
+        )
+        velocity = 1e-2 * columns(data["vx"], data["vy"], data["vz"])
+        metadata = {"message": "GLOBAL_POSITION_INT", "origin": "autopilot_origin"}
+        made.append(odometry_series("/autopilot/odometry", times, position, velocity, None, metadata))
+    return made
+
+
+def _origins(
+    autopilot: Autopilot, ardupilot: bool, undulation: float
+) -> tuple[dict[str, str], tuple[float, float, float] | None]:
+    """Return the datum of each local frame as metadata, and the origin of the autopilot's estimate."""
+    entries = {"altitude_datum": "mean sea level"}
+    origin = None
+    for message, name in (("GPS_GLOBAL_ORIGIN", "autopilot_origin"), ("HOME_POSITION", "home")):
+        data = autopilot.messages(message).data
+        if len(data):
+            row = data[-1]
+            point = (1e-7 * row["latitude"], 1e-7 * row["longitude"], 1e-3 * row["altitude"] + undulation)
+            entries |= describe_origin(name, point, ardupilot_scales(point[0]) if ardupilot else (1.0, 1.0))
+            origin = origin or point
+    return entries, origin
+
+
+def _truth(autopilot: Autopilot, entries: dict[str, str], undulation: float) -> list[Series]:
+    """Return /truth/odometry from SIM_STATE, relative to its first place, which is added to the origins.
+
+    SIM_STATE carries no time, and its floating-point latitude and longitude hold 1e-7 deg in some versions:
+    only the integers of newer ones are used.
+    """
+    found = autopilot.messages("SIM_STATE")
+    found = found[(found.data["lat_int"] != 0) | (found.data["lon_int"] != 0)]
+    if not len(found):
+        return []
+    data = found.data
+    times = autopilot.stamped_by_arrival(found)
+    places = columns(1e-7 * data["lat_int"], 1e-7 * data["lon_int"], data["alt"] + undulation)
+    origin = (float(places[0, 0]), float(places[0, 1]), float(places[0, 2]))
+    entries |= describe_origin("truth_origin", origin, ardupilot_scales(origin[0]))
+    velocity = columns(data["vn"], data["ve"], data["vd"])
+    q = columns(*(data[f"q{k}"] for k in (1, 2, 3, 4)))
+    metadata = {
+        "message": "SIM_STATE",
+        "origin": "truth_origin",
+        "stamp": "the arrival on the autopilot's clock: late by the link's delay",
+    }
+    position = ardupilot_positions(places, origin)
+    return [odometry_series("/truth/odometry", times, position, velocity, q, metadata)]
+
+
+def _texts(autopilot: Autopilot) -> list[Series]:
+    """Return /log from STATUSTEXT, long texts put together again; a text is stamped with its arrival."""
+    found = autopilot.messages("STATUSTEXT")
+    texts: list[str] = []
+    levels: list[int] = []
+    first: list[int] = []
+    open_id = 0
+    for k, row in enumerate(found.data):
+        text, part = text_of(row["text"]), int(row["id"])
+        if part and part == open_id and row["chunk_seq"]:
+            texts[-1] += text
+            continue
+        open_id = part
+        texts.append(text)
+        levels.append(_LEVELS[min(int(row["severity"]), 7)])
+        first.append(k)
+    mask = np.zeros(len(found), dtype=np.bool_)
+    mask[first] = True
+    times = autopilot.stamped_by_arrival(found[mask])
+    return log_series(times, "STATUSTEXT", levels, texts)
+
+
+def _source(autopilot: Autopilot, ardupilot: bool) -> dict[str, str]:
+    """Return what is known of the log as a whole; ``utc_offset_ns`` is the autopilot's UTC less boot time."""
+    entries = {
+        "autopilot": "ardupilot" if ardupilot else "unknown",
+        "format": "telemetry",
+        "system_id": str(autopilot.system),
+    }
+    clock = autopilot.messages("SYSTEM_TIME").data
+    clock = clock[clock["time_unix_usec"] > 0]
+    if len(clock):
+        utc = (
+            clock["time_unix_usec"].astype(np.int64) * 1000
+            - clock["time_boot_ms"].astype(np.int64) * 1_000_000
+        )
+        entries["utc_offset_ns"] = str(int(np.sort(utc)[len(utc) // 2]))
+    left = {n: k for n, k in autopilot.log.names().items() if n not in autopilot.used | _HANDLED}
+    entries["not_imported"] = ", ".join(f"{n} {k}" for n, k in sorted(left.items()))
+    return entries
