@@ -30,6 +30,7 @@ class Raw:
     logs: dict[int, list[NDArray[np.int64]]] = field(default_factory=dict)
     places: dict[int, list[NDArray[np.int64]]] = field(default_factory=dict)
     data: dict[int, list[NDArray[np.void]]] = field(default_factory=dict)
+    too_short: int = 0
 
     def add(
         self, records: bytes | memoryview, offsets: NDArray[np.int64], head: NDArray[np.void], base: int
@@ -38,6 +39,9 @@ class Raw:
         sizes = head["length"].astype(np.int64) - 22
         for size in np.unique(sizes).tolist():
             chosen = sizes == size
+            if size < 4:
+                self.too_short += int(chosen.sum())
+                continue
             self.logs.setdefault(size, []).append(head["log"][chosen].astype(np.int64))
             self.places.setdefault(size, []).append(base + offsets[chosen])
             self.data.setdefault(size, []).append(gather(records, offsets[chosen], size))
@@ -72,7 +76,7 @@ def decode(
     groups, those of equal columns are joined, and strings that differ among them are left out.
     """
     parts: list[_Part] = []
-    undecoded = 0
+    undecoded = raw.too_short
     for logs, places, data in raw.groups():
         undecoded += _split(parts, definition, logs, places, data)
     joined: dict[tuple[object, ...], list[_Part]] = {}

@@ -12,6 +12,7 @@ import struct
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -35,6 +36,8 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
+from logs.errors import LogError
+
 MAGIC = b"\x89MCAP0\r\n"
 MESSAGE_HEADER = np.dtype(
     [
@@ -55,6 +58,20 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK_HEAD = struct.Struct("<BQQQQI")
 _PREFIXED = struct.Struct("<I")
 ZSTD_LEVEL = 1
+
+
+def create(path: Path, force: bool) -> BinaryIO:
+    """Create a file for writing.
+
+    Raises:
+        LogError: it exists and ``force`` is not set, or cannot be created.
+    """
+    try:
+        return path.open("wb" if force else "xb")
+    except FileExistsError:
+        raise LogError(path, "the file exists", "choose another name or use --force") from None
+    except OSError as error:
+        raise LogError(path, f"cannot be created ({error.strerror})", "check the folder") from None
 
 
 @dataclass(slots=True)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from estimation.events import Event
 from logs.cdr import FRAME_ID, Columns, Layout, LayoutError, layout
-from logs.container import INDEX_ENTRY, MESSAGE_HEADER, Container
+from logs.container import INDEX_ENTRY, MESSAGE_HEADER, Container, create
 from logs.definition import parse
 from logs.encode import encode
 from logs.errors import LogError
@@ -68,12 +68,7 @@ class FlightWriter:
         self, path: str | Path, *, force: bool = False, clock_offsets_ns: Mapping[str, int] | None = None
     ) -> None:
         self.path = Path(path)
-        try:
-            self._file = self.path.open("wb" if force else "xb")
-        except FileExistsError:
-            raise LogError(path, "the file exists", "choose another name or use --force") from None
-        except OSError as error:
-            raise LogError(path, f"cannot be created ({error.strerror})", "check the folder") from None
+        self._file = create(self.path, force)
         self._container = Container(self._file, LIBRARY, chunk_size=_CHUNK_BYTES)
         self._offsets: dict[str, int] = {}
         self._channels: dict[tuple[object, ...], int] = {}
