@@ -1,0 +1,460 @@
+"""The target detector: an image in, the target's position with its covariance out, or the reason why not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimation.frames import R_CB_NOMINAL, skew
+from vision.area import fit_area
+from vision.camera import Camera, check_rotation
+from vision.ellipse import plane_rotations
+from vision.plane import LevelPlane, rotation_to_level, rotation_vector_xy, rotation_xy
+from vision.redness import ratio_table, red_mask
+from vision.refine import MIN_GAP_PX, MIN_RADIUS_PX, Fit, edge_gaps, fit_profiles
+from vision.rings import (
+    Contours,
+    Hypothesis,
+    find_contours,
+    halve,
+    identify_circles,
+    identify_votes,
+)
+from vision.target import RingTarget
+from vision.thesis import thesis_detect
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+AUTO_TILT_SIGMA_RAD = 0.14
+"""Prior of the deck's tilt when an image contradicts a level deck."""
+FREE_TILT_SIGMA_RAD = 0.6
+"""Prior of the plane's tilt about the one that an ellipse gave, where no attitude is known."""
+THESIS_RELATIVE_SIGMA = 0.07
+"""1-sigma per axis of a fix by the thesis's method, as a share of the distance (its reported errors: 6-8 %)."""
+MAX_DECK_TILT_RAD = 0.27
+MIN_GAIN_OVER_DISC = 1.7
+"""How many times worse a plain disc has to fit a target whose rings are not resolved."""
+
+
+@dataclass(frozen=True, slots=True)
+class VisionFix:
+    """Where the target's centre is, in the camera frame.
+
+    ``position_cam_m`` (3,) is P^c of seed (4.27); ``covariance_m2`` (3, 3). ``rings`` are the indices of the edges
+    that were measured (into ``RingTarget.edges_m``), ``residual_px`` the scatter of their displacements from the
+    model, ``tilt_rad`` (2,) the rotation of the deck about the level x and y axes where it was estimated, else None.
+    ``share`` of the visible edge length that agrees with the model, ``blur_px`` the blur's 1-sigma. ``rotation``
+    takes the camera to the plane of the target (``R_nc`` for a level deck). ``points_px`` (n, 2) are the places that
+    were compared and ``agrees`` (n,) the outcome.
+    """
+
+    position_cam_m: Array
+    covariance_m2: Array
+    rings: tuple[int, ...]
+    residual_px: float
+    share: float
+    blur_px: float
+    method: str
+    rotation: Array
+    tilt_rad: Array | None = None
+    points_px: Array | None = None
+    agrees: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NoFix:
+    """No target, and why. False in a condition."""
+
+    reason: str
+
+    def __bool__(self) -> bool:
+        """Return False, so that ``if fix:`` reads well."""
+        return False
+
+
+class TargetDetector:
+    """Finds a ring target in images of one camera.
+
+    Parameters
+    ----------
+    camera, target
+        What looks, and what is looked for.
+    method
+        ``"rings"``, or ``"thesis"`` for seed chapter 4 as it was written (``vision.thesis``).
+    attitude_sigma_rad
+        1-sigma error of ``R_nc`` about each axis. It widens the prior of the relative tilt, and the covariance by
+        ``sigma^2 [P]x [P]x'``: the error that the fix gets when it is rotated to NED by the same ``R_nc``. A filter
+        that carries the attitude's error itself leaves this at zero and states ``deck_tilt_sigma_rad``.
+    deck_tilt_sigma_rad
+        1-sigma tilt of the deck about each level axis. Zero: the deck is taken as level (seed 3) unless the image
+        contradicts it clearly.
+    focal_sigma
+        Relative 1-sigma error of the focal length.
+    principal_point_sigma_px
+        1-sigma error of the principal point.
+    model_error_px
+        Floor of the error of an edge's place that all edges share.
+    R_cb
+        Body to camera, shape (3, 3); used only to turn ``body_rate_radps`` for rolling shutters.
+    min_share
+        Least share of the visible edge length that has to agree with the model.
+
+    Raises ``ValueError`` naming the argument.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        target: RingTarget,
+        *,
+        method: str = "rings",
+        attitude_sigma_rad: float = 0.0,
+        deck_tilt_sigma_rad: float = 0.0,
+        focal_sigma: float = 0.0,
+        principal_point_sigma_px: float = 0.0,
+        model_error_px: float = 0.003,
+        R_cb: ArrayLike = R_CB_NOMINAL,
+        min_share: float = 0.55,
+    ) -> None:
+        if not isinstance(camera, Camera):
+            raise ValueError(f"camera: a {type(camera).__name__}, not a vision.Camera")
+        if not isinstance(target, RingTarget):
+            raise ValueError(f"target: a {type(target).__name__}, not a vision.RingTarget")
+        if method not in ("rings", "thesis"):
+            raise ValueError(f"method: {method!r} is neither 'rings' nor 'thesis'")
+        self.camera = camera
+        self.target = target
+        self.method = method
+        self.attitude_sigma_rad = _sigma("attitude_sigma_rad", attitude_sigma_rad, 1.0)
+        self.deck_tilt_sigma_rad = _sigma("deck_tilt_sigma_rad", deck_tilt_sigma_rad, 1.0)
+        self.focal_sigma = _sigma("focal_sigma", focal_sigma, 0.5)
+        self.principal_point_sigma_px = _sigma("principal_point_sigma_px", principal_point_sigma_px, 1e3)
+        self.model_error_px = _sigma("model_error_px", model_error_px, 10.0)
+        self.min_share = _sigma("min_share", min_share, 1.0)
+        self._R_cb = check_rotation(R_cb, "R_cb")
+        self._edges = np.asarray(target.edges_m, dtype=np.float64)
+        self._margin_m = 0.5 * target.side_m - self._edges[0]
+        self._tables = tuple(ratio_table(ratio) for ratio in (1.3, 1.8))
+
+    def detect(
+        self,
+        image_bgr: Image,
+        R_nc: ArrayLike | None = None,
+        prior: VisionFix | ArrayLike | None = None,
+        body_rate_radps: ArrayLike | None = None,
+    ) -> VisionFix | NoFix:
+        """Return the fix of one image, or why there is none.
+
+        Parameters
+        ----------
+        image_bgr
+            (height, width, 3) uint8, contiguous, as OpenCV reads it.
+        R_nc
+            Camera to NED, shape (3, 3), at the image's time. Without it the plane is found from the rings' shape,
+            with a wider covariance.
+        prior
+            Where the target is expected, P^c [m], or the last fix; it is tried first and saves the search.
+        body_rate_radps
+            Angular velocity of the body (FRD), used for cameras with a read-out time.
+
+        Raises ``ValueError`` naming the argument that is wrong.
+        """
+        image = self.camera.check_image(image_bgr)
+        rotation = None if R_nc is None else check_rotation(R_nc, "R_nc")
+        rate = None
+        if body_rate_radps is not None:
+            rate_body = _vector("body_rate_radps", body_rate_radps)
+            if self.camera.readout_s > 0.0:
+                rate = self._R_cb @ rate_body
+        if self.method == "thesis":
+            return self._thesis(image, rotation)
+        if prior is not None:
+            fix = self._track(image, rotation, prior, rate)
+            if fix is not None:
+                return fix
+        return self._search(image, rotation, rate)
+
+    def _thesis(self, image: Image, rotation: Array | None) -> VisionFix | NoFix:
+        """Return the fix of seed chapter 4; it has no covariance of its own, so that it gets its reported error."""
+        result = thesis_detect(self.camera, self.target, image, rotation)
+        position = result.position_cam_m
+        if position is None:
+            return NoFix(result.reason)
+        sigma = THESIS_RELATIVE_SIGMA * float(np.linalg.norm(position))
+        points = np.concatenate([np.asarray(c).reshape(-1, 2) for c in result.contours]).astype(np.float64)
+        return VisionFix(
+            position,
+            np.eye(3) * sigma**2,
+            tuple(range(len(result.contours))),
+            float("nan"),
+            1.0,
+            float("nan"),
+            "thesis",
+            np.eye(3) if rotation is None else rotation,
+            None,
+            points,
+            np.ones(len(points), dtype=np.bool_),
+        )
+
+    def _track(
+        self, image: Image, rotation: Array | None, prior: VisionFix | ArrayLike, rate: Array | None
+    ) -> VisionFix | None:
+        expected = _position(prior)
+        last = prior.rotation if isinstance(prior, VisionFix) else None
+        tilt = np.zeros(2)
+        if rotation is None:
+            if last is None:
+                return None
+            plane = LevelPlane(self.camera, last, rate)
+        else:
+            plane = LevelPlane(self.camera, rotation, rate)
+            if isinstance(prior, VisionFix) and prior.tilt_rad is not None:
+                tilt = prior.tilt_rad
+                plane = plane.tilted(rotation_xy(tilt[0], tilt[1]))
+        p = plane.rotation @ expected
+        if not p[2] > 0.0:
+            return None
+        candidate = _Candidate(Hypothesis(p[:2] / p[2], 1.0 / float(p[2]), (), 1.0), plane, tilt)
+        fit = self._fit(image, candidate, rotation is None)
+        return None if isinstance(fit, str) else self._fix([fit], rotation, "tracked")
+
+    def _search(self, image: Image, rotation: Array | None, rate: Array | None) -> VisionFix | NoFix:
+        reason = "no red region of the target's kind"
+        for contours in self._contour_sets(image):
+            for candidates in self._candidates(contours, rotation, rate):
+                accepted: list[Fit] = []
+                for candidate in candidates:
+                    fit = self._fit(image, candidate, rotation is None)
+                    if isinstance(fit, str):
+                        reason = fit
+                        continue
+                    accepted.append(fit)
+                    if rotation is not None and _beyond_doubt(fit):
+                        break
+                if accepted:
+                    return self._fix(accepted, rotation, "found")
+            if len(contours) and reason.startswith("no red"):
+                reason = "red regions, but no concentric rings of the target's ratios"
+        return NoFix(reason)
+
+    def _contour_sets(self, image: Image) -> Iterator[Contours]:
+        table, strict = self._tables
+        yield find_contours(red_mask(halve(image), table), True)
+        yield find_contours(red_mask(image, table), False)
+        yield find_contours(red_mask(image, strict), False)
+
+    def _candidates(
+        self, contours: Contours, rotation: Array | None, rate: Array | None
+    ) -> Iterator[list[_Candidate]]:
+        """Yield lists of candidates, the cheapest and likeliest first."""
+        if not len(contours):
+            return
+        level = np.zeros(2)
+        if rotation is not None:
+            plane = LevelPlane(self.camera, rotation, rate)
+            yield [_Candidate(h, plane, level) for h in identify_circles(contours, plane, self._edges)]
+            yield [_Candidate(h, plane, level) for h in identify_votes(contours, plane, self._edges)]
+        candidates = []
+        for plane in self._ellipse_planes(contours, rate):
+            tilt = level
+            if rotation is not None:
+                # A deck that is tilted against the level: its normal stays near the vertical.
+                turn = rotation_to_level(rotation @ plane.rotation[2])
+                tilt = rotation_vector_xy(turn)
+                if np.hypot(*tilt) > MAX_DECK_TILT_RAD:
+                    continue
+                plane = LevelPlane(self.camera, turn @ rotation, rate)
+            candidates += [_Candidate(h, plane, tilt) for h in identify_circles(contours, plane, self._edges)]
+        yield candidates
+
+    def _ellipse_planes(self, contours: Contours, rate: Array | None) -> Iterator[LevelPlane]:
+        """Yield the planes in which one of the longest contours is a circle."""
+        plane = LevelPlane(self.camera, np.eye(3), rate)
+        x, y = plane.rays(contours.u, contours.v)
+        inside = plane.inside(contours.u, contours.v, contours.step_px)
+        count = np.diff(contours.start)
+        for i in np.argsort(-count, kind="stable")[:6]:
+            mine = slice(contours.start[i], contours.start[i + 1])
+            ok = inside[mine]
+            if ok.sum() >= 16:
+                max_rms = 0.7 * contours.step_px / self.camera.fx
+                for rotation in plane_rotations(x[mine][ok], y[mine][ok], max_rms):
+                    yield LevelPlane(self.camera, rotation, rate)
+
+    def _fit(self, image: Image, candidate: _Candidate, free: bool) -> Fit | str:
+        """Fit a candidate and judge it: the fit, or the reason why it is none."""
+        plane, hypothesis = candidate.plane, candidate.hypothesis
+        unit = float(plane.units_per_pixel(hypothesis.centre[0], hypothesis.centre[1]))
+        to_px = hypothesis.kappa / unit
+        usable = (edge_gaps(self._edges) * to_px > MIN_GAP_PX) & (self._edges * to_px > MIN_RADIUS_PX)
+        sigma = (
+            FREE_TILT_SIGMA_RAD
+            if free
+            else float(np.hypot(self.attitude_sigma_rad, self.deck_tilt_sigma_rad))
+        )
+        if usable.sum() < min(3, len(self._edges)):
+            small = fit_area(
+                image,
+                plane,
+                hypothesis.centre,
+                hypothesis.kappa,
+                self._edges,
+                margin_m=self._margin_m,
+                tilt_sigma_rad=sigma,
+            )
+            return _judge_area(small)
+
+        def fit_with(tilt_sigma_rad: float) -> Fit | None:
+            return fit_profiles(
+                image,
+                plane,
+                hypothesis.centre,
+                hypothesis.kappa,
+                self._edges,
+                tilt_sigma_rad=tilt_sigma_rad,
+                tilt=candidate.tilt,
+            )
+
+        fit = fit_with(sigma or (AUTO_TILT_SIGMA_RAD if candidate.tilt.any() else 0.0))
+        if sigma == 0.0 and not candidate.tilt.any() and _doubtful(fit):
+            # Does the image contradict a level deck?
+            tilted = fit_with(AUTO_TILT_SIGMA_RAD)
+            if tilted is not None and (fit is None or _clearly_better(tilted, fit)):
+                fit = tilted
+        return _judge_profiles(fit, self.min_share)
+
+    def _fix(self, fits: list[Fit], rotation: Array | None, how: str) -> VisionFix:
+        best = max(fits, key=_rank)
+        position, covariance = self._position(best, rotation is not None)
+        if rotation is None:
+            # Two planes see the same ellipse; where they fit equally well, either may be the right one.
+            for other in fits:
+                if other is not best and other.residual_px < 1.2 * best.residual_px:
+                    d = self._position(other, False)[0] - position
+                    covariance = covariance + 0.5 * np.outer(d, d)
+        tilt = None
+        if rotation is not None and best.tilt_free:
+            tilt = rotation_vector_xy(best.plane.rotation @ rotation.T)
+        return VisionFix(
+            position,
+            covariance,
+            best.edges,
+            best.residual_px,
+            best.share,
+            best.blur_px,
+            how,
+            best.plane.rotation,
+            tilt,
+            best.points_px,
+            best.agrees,
+        )
+
+    def _position(self, fit: Fit, known_attitude: bool) -> tuple[Array, Array]:
+        """Return P^c [m] and its covariance [m^2]."""
+        plane, kappa = fit.plane, fit.kappa
+        ray = np.array([fit.centre[0], fit.centre[1], 1.0])
+        back = plane.rotation.T
+        position = back @ ray / kappa
+        jacobian = np.empty((3, 5))
+        jacobian[:, :2] = back[:, :2] / kappa
+        jacobian[:, 2] = -position / kappa
+        jacobian[:, 3:] = (back @ skew(ray))[:, :2] / kappa
+        unit = float(plane.units_per_pixel(fit.centre[0], fit.centre[1]))
+        radius_px = kappa * self._edges[min(fit.edges)] / unit
+        inner = fit.covariance.copy()
+        inner[0, 0] += (self.model_error_px * unit) ** 2
+        inner[1, 1] += (self.model_error_px * unit) ** 2
+        inner[2, 2] += (self.model_error_px * kappa / radius_px) ** 2
+        covariance = jacobian @ inner @ jacobian.T
+        sigmas = (self.focal_sigma, self.principal_point_sigma_px, self.principal_point_sigma_px)
+        shifts = jacobian @ fit.considered * sigmas
+        covariance += shifts @ shifts.T
+        if known_attitude and self.attitude_sigma_rad > 0.0:
+            turn = skew(position)
+            covariance += self.attitude_sigma_rad**2 * (turn @ turn.T)
+        return position, 0.5 * (covariance + covariance.T)
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A hypothesis, the plane it holds in, and that plane's tilt against the level (2,) [rad]."""
+
+    hypothesis: Hypothesis
+    plane: LevelPlane
+    tilt: Array
+
+
+def _beyond_doubt(fit: Fit) -> bool:
+    return fit.share > 0.8 and len(fit.edges) >= 3 and (not fit.is_area or fit.chi2 > 25.0)
+
+
+def _rank(fit: Fit) -> tuple[float, float]:
+    if fit.is_area:
+        return 0.5, fit.chi2
+    return float(round(5.0 * fit.share)), -fit.residual_px
+
+
+def _doubtful(fit: Fit | None) -> bool:
+    return fit is None or fit.share < 0.8 or fit.residual_px > 0.1 or fit.chi2 > 3.0
+
+
+def _clearly_better(tilted: Fit, level: Fit) -> bool:
+    """Return whether freeing the tilt explains the image much better (likelihood ratio over all lines)."""
+    if tilted.share > level.share + 0.1:
+        return True
+    ratio = level.count * 2.0 * np.log(max(level.residual_px, 1e-6) / max(tilted.residual_px, 1e-6))
+    return tilted.share > level.share - 0.02 and bool(ratio > 25.0)
+
+
+def _judge_profiles(fit: Fit | None, min_share: float) -> Fit | str:
+    if fit is None:
+        return "rings of the target's ratios, but too few of their edges fit"
+    if fit.share < min_share:
+        return f"only {fit.share:.0%} of the visible edges fit the target"
+    if len(fit.edges) < min(3, fit.n_visible) or len(fit.edges) < 2 or fit.count < 16:
+        return f"only {len(fit.edges)} edge(s) of the target fit"
+    if fit.residual_px > 0.6:
+        return f"edges are {fit.residual_px:.1f} px off the target's"
+    if not fit.covariance[2, 2] < (0.05 * fit.kappa) ** 2:
+        return "the scale is not observable"
+    return fit
+
+
+def _judge_area(fit: Fit | None) -> Fit | str:
+    if fit is None:
+        return "a small red region that is no target"
+    if fit.share < 0.85 or fit.residual_px > 0.12:
+        return f"a small red region that differs from the target by {fit.residual_px:.0%} of its contrast"
+    if fit.chi2 < MIN_GAIN_OVER_DISC or abs(fit.growth_px) > 0.4 or fit.blur_px > 2.5:
+        return "a small red disc without visible rings"
+    if not fit.covariance[2, 2] < (0.1 * fit.kappa) ** 2:
+        return "the scale is not observable"
+    return fit
+
+
+def _sigma(name: str, value: float, limit: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {value!r} is not a number") from error
+    if not 0.0 <= number <= limit:
+        raise ValueError(f"{name}: {number!r} is not between 0 and {limit:g}")
+    return number
+
+
+def _vector(name: str, value: ArrayLike) -> Array:
+    try:
+        vector = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: not an array of numbers") from error
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name}: not three finite numbers")
+    return vector
+
+
+def _position(prior: VisionFix | ArrayLike) -> Array:
+    return prior.position_cam_m if isinstance(prior, VisionFix) else _vector("prior", prior)
