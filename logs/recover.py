@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,21 +54,19 @@ def recover(src: str | Path, dst: str | Path, *, force: bool = False) -> Recover
 
     Raises:
         LogError: ``src`` is no MCAP file or nothing of it can be read, or ``dst`` exists (without ``force``)
-        or is
-            the same file.
+            or is the same file.
     """
     source, target = Path(src), Path(dst)
     if target.exists() and source.exists() and target.samefile(source):
         raise LogError(target, "source and target are the same file", "choose another name")
     data = FileBytes(source)
     contents = scan(source, data)
-    if not (contents.chunks or contents.loose or contents.metadata or contents.attachments):
-        if not contents.complete:
-            raise LogError(source, "nothing in the file can be read", "it cannot be recovered")
+    found = contents.chunks or contents.loose or contents.metadata or contents.attachments
+    if not found and not contents.complete:
+        raise LogError(source, "nothing in the file can be read", "it cannot be recovered")
     with create(target, force) as stream:
         copy = _Copy(data, contents, Container(stream, contents.library or "deckfix", contents.profile))
-        report = copy.run()
-    return report
+        return copy.run()
 
 
 class _Copy:
@@ -137,7 +136,8 @@ class _Copy:
                 reached = max((int(e["log"].max()) for e in known.values()), default=chunk.first_ns)
                 self.lost_ns += max(chunk.last_ns - reached, 0)
         else:
-            self.container.write_stored_chunk(stored, chunk.compression, len(records), chunk.crc, known)
+            crc = chunk.crc or zlib.crc32(records)
+            self.container.write_stored_chunk(stored, chunk.compression, len(records), crc, known)
             self.container.count(known)
         self.chunks += bool(known)
 
