@@ -19,7 +19,7 @@ from logs.ardupilot_tables import Table, TimedTables, has
 from logs.dataflash import is_dataflash, read_dataflash
 from logs.dataflash_format import DataflashLog, text_of
 from logs.dataflash_text import read_dataflash_text
-from logs.datum import ardupilot_origin, ardupilot_scales, describe_origin
+from logs.datum import ardupilot_origin, describe_origin
 from logs.recording import Recording, Series
 from logs.sensors import (
     ERROR,
@@ -306,7 +306,7 @@ def _origins(tables: TimedTables, undulation: float | None) -> dict[str, str]:
     for kind, name in ((0, "autopilot_origin"), (1, "home")):
         if origin is not None and len(rows := origin[0][origin[0]["Type"] == kind]):
             point = (rows[0]["Lat"], rows[0]["Lng"], rows[0]["Alt"] + (undulation or 0.0))
-            entries |= describe_origin(name, point, ardupilot_scales(point[0]))
+            entries |= describe_origin(name, point)
     place = tables.rows("SIM", "Lat", "Lng", "Alt")
     motion = tables.rows("SIM2", "PN", "PE", "PD")
     if place is not None and motion is not None:
@@ -316,7 +316,7 @@ def _origins(tables: TimedTables, undulation: float | None) -> dict[str, str]:
         truth = ardupilot_origin(there, columns(moves["PN"], moves["PE"], moves["PD"]))
         if truth is not None:
             truth = (truth[0], truth[1], truth[2] + (undulation or 0.0))
-            entries |= describe_origin("truth_origin", truth, ardupilot_scales(truth[0]))
+            entries |= describe_origin("truth_origin", truth)
     return entries
 
 

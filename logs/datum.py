@@ -1,9 +1,10 @@
 """Where local positions in a log are measured from, and in what metres.
 
-ArduPilot converts between degrees and local metres on a sphere, not on the WGS-84 ellipsoid: one degree of
-latitude is 111 318.845 m, one of longitude that times the cosine of the latitude (``Location.cpp``). A filter
-that works on the ellipsoid sees the same fixes up to 0.35 % farther apart, so each origin comes with the two
-factors that turn the log's metres north and east into metres on the ellipsoid at that place.
+Autopilots convert between degrees and local metres on a sphere, not on the WGS-84 ellipsoid: ArduPilot's has
+a radius of 6 378 100 m (``Location.cpp``: 0.011131884502145034 m per 1e-7 deg of latitude), PX4's one of
+6 371 000 m (``geo.h``). A filter that works on the ellipsoid sees the same fixes up to half a percent nearer
+together or farther apart, so each origin comes with the two factors that turn the log's metres north and east
+into metres on the ellipsoid at that place.
 """
 
 from __future__ import annotations
@@ -16,17 +17,20 @@ from numpy.typing import NDArray
 from estimation.frames import WGS84_A_M, WGS84_E2
 
 _DEGREE_M = 111_318.84502145034
-"""Length of one degree of latitude on ArduPilot's sphere [m] (0.011131884502145034 m per 1e-7 deg)."""
+"""Length of one degree of latitude on ArduPilot's sphere [m] ."""
 
 
-def ardupilot_scales(latitude_deg: float) -> tuple[float, float]:
-    """Return the factors north and east from ArduPilot's local metres to metres on the ellipsoid."""
+ARDUPILOT_RADIUS_M = math.degrees(_DEGREE_M)
+PX4_RADIUS_M = 6_371_000.0
+
+
+def sphere_scales(latitude_deg: float, radius_m: float) -> tuple[float, float]:
+    """Return the factors north and east from local metres on a sphere to metres on the ellipsoid."""
     latitude = math.radians(latitude_deg)
     w2 = 1.0 - WGS84_E2 * math.sin(latitude) ** 2
     meridian = WGS84_A_M * (1.0 - WGS84_E2) / w2**1.5
     normal = WGS84_A_M / math.sqrt(w2)
-    sphere = math.degrees(_DEGREE_M)
-    return meridian / sphere, normal / sphere
+    return meridian / radius_m, normal / radius_m
 
 
 def ardupilot_origin(
@@ -64,9 +68,10 @@ def ardupilot_positions(
 
 
 def describe_origin(
-    name: str, point: tuple[float, float, float], scales: tuple[float, float] = (1.0, 1.0)
+    name: str, point: tuple[float, float, float], radius_m: float = ARDUPILOT_RADIUS_M
 ) -> dict[str, str]:
     """Return an origin as metadata: latitude, longitude [deg], altitude [m], factors north and east."""
+    scales = sphere_scales(point[0], radius_m)
     values = dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), point, strict=True))
     values |= {"north_scale": scales[0], "east_scale": scales[1]}
     return {f"{name}_{key}": repr(float(value)) for key, value in values.items()}

@@ -16,7 +16,7 @@ import numpy as np
 from logs.ardupilot import filter_delay
 from logs.companion import read_companion
 from logs.dataflash_format import text_of
-from logs.datum import ardupilot_positions, ardupilot_scales, describe_origin
+from logs.datum import ARDUPILOT_RADIUS_M, PX4_RADIUS_M, ardupilot_positions, describe_origin
 from logs.recording import Recording, Series
 from logs.sensors import (
     DEBUG,
@@ -275,12 +275,13 @@ def _origins(
     """Return the datum of each local frame as metadata, and the origin of the autopilot's estimate."""
     entries = {"altitude_datum": "mean sea level"}
     origin = None
+    radius = ARDUPILOT_RADIUS_M if ardupilot else PX4_RADIUS_M
     for message, name in (("GPS_GLOBAL_ORIGIN", "autopilot_origin"), ("HOME_POSITION", "home")):
         data = autopilot.messages(message).data
         if len(data):
             row = data[-1]
             point = (1e-7 * row["latitude"], 1e-7 * row["longitude"], 1e-3 * row["altitude"] + undulation)
-            entries |= describe_origin(name, point, ardupilot_scales(point[0]) if ardupilot else (1.0, 1.0))
+            entries |= describe_origin(name, point, radius)
             origin = origin or point
     return entries, origin
 
@@ -299,7 +300,7 @@ def _truth(autopilot: Autopilot, entries: dict[str, str], undulation: float) -> 
     times = autopilot.stamped_by_arrival(found)
     places = columns(1e-7 * data["lat_int"], 1e-7 * data["lon_int"], data["alt"] + undulation)
     origin = (float(places[0, 0]), float(places[0, 1]), float(places[0, 2]))
-    entries |= describe_origin("truth_origin", origin, ardupilot_scales(origin[0]))
+    entries |= describe_origin("truth_origin", origin)
     velocity = columns(data["vn"], data["ve"], data["vd"])
     q = columns(*(data[f"q{k}"] for k in (1, 2, 3, 4)))
     metadata = {
