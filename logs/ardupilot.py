@@ -43,6 +43,12 @@ from logs.sensors import (
     velocity_series,
 )
 
+VISION_HINT = (
+    "vision fixes are not taken from PL, which repeats and rounds them: merge the flight's telemetry log "
+    "(.tlog), whose LANDING_TARGET messages are exact"
+)
+"""Problem of a log that a merge with a telemetry log solves."""
+
 _MILLIGAUSS_T = 1e-7
 _DOWNWARD = 25
 _RANGE_SEEN = 2
@@ -357,7 +363,4 @@ def _tell(tables: TimedTables, out: Recording) -> None:
         which = ", ".join(f"{n} {k}" for n, k in sorted(tables.left_out.items()))
         out.problems.append(f"messages whose time was damaged or ran backwards were left out: {which}")
     if "PL" in tables.log.tables:
-        out.problems.append(
-            "vision fixes are not taken from PL, which repeats and rounds them: merge the flight's telemetry "
-            "log (.tlog), whose LANDING_TARGET messages are exact"
-        )
+        out.problems.append(VISION_HINT)

@@ -234,6 +234,8 @@ def _check_sums(raw: Bytes, start: Offsets, length: Offsets, seed: NDArray[np.in
     """Return whether the two bytes behind ``length`` bytes from ``start`` on are their check sum."""
     table = _crc_table()
     good = np.zeros(len(start), dtype=np.bool_)
+    if len(start) == 0:
+        return good
     order = np.argsort(length, kind="stable")
     sizes, firsts = np.unique(length[order], return_index=True)
     for size, first, last in zip(
