@@ -179,8 +179,8 @@ def states(result: Result, block: str) -> Figure:
     ranges = []
     titles = []
     for row, i in enumerate(chosen, start=1):
-        value = result.run.state_values[:, i] * factor
-        sigma = 3.0 * result.run.state_sigmas[:, i] * factor
+        value = result.state_values[:, i] * factor
+        sigma = 3.0 * result.run.sigma[:, i] * factor
         data += band(t, value - sigma, value + sigma, "±3 sigma", row, legend=row == 1)
         data.append(line(t, value, "estimate", OURS, row, legend=row == 1))
         late = t > 0.25 * t[-1] if len(t) else np.zeros(0, dtype=bool)
@@ -291,7 +291,9 @@ def _others(result: Result) -> list[tuple[str, tuple[Array, Array], str, dict[st
         if trajectory is None or trajectory.position_m is None:
             continue
         own = trajectory.position_m
-        datum = np.nanmedian(result.run.position_m - own.at(result.run.t_ns), axis=0) if len(result.t_s) else 0.0
+        datum = (
+            np.nanmedian(result.run.position_m - own.at(result.run.t_ns), axis=0) if len(result.t_s) else 0.0
+        )
         shifted = own.values + np.where(np.isfinite(datum), datum, 0.0)
         out.append((name, ((own.t_ns - result.start_ns) * 1e-9, shifted), colour, dict(style)))
     return out
@@ -386,7 +388,9 @@ def _curve_traces(result: Result, curves: _Curves, first_axes: int, *, legend: b
         low, high = curves.centre[:, i] - 3 * curves.sigma[:, i], curves.centre[:, i] + 3 * curves.sigma[:, i]
         data += band(t, low, high, "±3 sigma", axes, legend=show)
         if curves.autopilot is not None and curves.autopilot_s is not None:
-            data.append(line(curves.autopilot_s, curves.autopilot[:, i], "autopilot", AUTOPILOT, axes, legend=show))
+            data.append(
+                line(curves.autopilot_s, curves.autopilot[:, i], "autopilot", AUTOPILOT, axes, legend=show)
+            )
         data.append(line(t, curves.ours[:, i], "deckfix", OURS, axes, legend=show))
     return data
 
@@ -417,7 +421,13 @@ def _contact_shapes(result: Result, row: int = 1) -> list[dict[str, object]]:
 def _block_unit(block: str) -> tuple[str, float]:
     if block == "gyro_bias":
         return "deg/s", 180.0 / np.pi
-    units = {"accel_bias": "m/s²", "gps_bias": "m", "baro_bias": "m", "camera_latency": "s", "camera_mount": "rad"}
+    units = {
+        "accel_bias": "m/s²",
+        "gps_bias": "m",
+        "baro_bias": "m",
+        "camera_latency": "s",
+        "camera_mount": "rad",
+    }
     return units.get(block, "-" if block == "range_scale" else "m"), 1.0
 
 

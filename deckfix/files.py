@@ -49,7 +49,9 @@ def check_output(path: str | Path, *, force: bool, inputs: Sequence[str | Path] 
 
 
 @contextmanager
-def output_file(path: str | Path, *, force: bool = False, inputs: Sequence[str | Path] = ()) -> Iterator[Path]:
+def output_file(
+    path: str | Path, *, force: bool = False, inputs: Sequence[str | Path] = ()
+) -> Iterator[Path]:
     """Give a temporary path beside ``path``; it takes its place when the block ends well, else it is removed.
 
     Raises ``OutputError`` as ``check_output`` does, before the block is entered; without ``force`` a file that

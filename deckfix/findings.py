@@ -72,7 +72,17 @@ _NEEDED = (
 
 def findings(result: Result) -> list[Finding]:
     """Return what is worth telling, the worst first; an empty list means that nothing was found."""
-    parts = (_readiness, _problems, _notes, _inputs, _outcomes, _consistency, _biases, _uncertainty, _messages)
+    parts = (
+        _readiness,
+        _problems,
+        _notes,
+        _inputs,
+        _outcomes,
+        _consistency,
+        _biases,
+        _uncertainty,
+        _messages,
+    )
     found = [f for part in parts for f in part(result)]
     return sorted(found, key=lambda f: -f.severity)
 
@@ -84,7 +94,9 @@ def verdict(result: Result, found: list[Finding]) -> str:
     if not len(result.run.t_ns):
         return "There is no estimate: the filter never became ready."
     if serious:
-        return f"Do not rely on this estimate before looking at the {_count(serious, 'serious finding')} below."
+        return (
+            f"Do not rely on this estimate before looking at the {_count(serious, 'serious finding')} below."
+        )
     if warnings:
         return f"The estimate is usable; {_count(warnings, 'thing')} deserve{'s' if warnings == 1 else ''} a look."
     return "The estimate is consistent with its sensors; nothing went wrong that can be seen from the log."
@@ -141,7 +153,9 @@ def _notes(result: Result) -> Iterator[Finding]:
         yield Finding(
             Severity.WARNING if alarming else Severity.NOTE,
             f"at {result.seconds(int(t_ns)):.1f} s: {text}",
-            "the filter's own note" if not alarming else "inertial data or fixes that the filter could not bridge",
+            "the filter's own note"
+            if not alarming
+            else "inertial data or fixes that the filter could not bridge",
             "compare with the sensors' coverage below" if alarming else "nothing to do",
         )
 
@@ -204,7 +218,11 @@ def _outcomes(result: Result) -> Iterator[Finding]:
                 continue
             severity = Severity.NOTE
             if not harmless:
-                severity = Severity.WARNING if share < 0.5 or outcome is Outcome.REJECTED_NOT_READY else Severity.SERIOUS
+                severity = (
+                    Severity.WARNING
+                    if share < 0.5 or outcome is Outcome.REJECTED_NOT_READY
+                    else Severity.SERIOUS
+                )
             if outcome is Outcome.REJECTED_NOT_READY and share > 0.99:
                 severity = Severity.NOTE
             yield Finding(

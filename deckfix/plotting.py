@@ -145,7 +145,14 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
         "paper_bgcolor": "#ffffff",
         "plot_bgcolor": "#ffffff",
         "font": {"family": FONT, "size": 12, "color": INK},
-        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom", "yref": "container", "font": {"size": 12}}
+        "legend": {
+            "orientation": "h",
+            "x": 0,
+            "y": 1,
+            "yanchor": "bottom",
+            "yref": "container",
+            "font": {"size": 12},
+        }
         | {"y": 0.995, "yanchor": "top"},
         "hovermode": "x",
         "hoverlabel": {"font": {"family": FONT, "size": 12}},
@@ -154,7 +161,9 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
     }
 
 
-def stacked(titles: Sequence[str], ranges: Sequence[tuple[float, float] | None], x_title: str) -> dict[str, Any]:
+def stacked(
+    titles: Sequence[str], ranges: Sequence[tuple[float, float] | None], x_title: str
+) -> dict[str, Any]:
     """Return axes for panels one above the other that share their time axis, the first on top."""
     n = len(titles)
     gap = 0.035 if n > 1 else 0.0

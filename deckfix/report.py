@@ -45,7 +45,9 @@ def render(result: Result) -> str:
         ("configuration", "Configuration", _configuration(result)),
     ]
     body = "".join(
-        f'<section id="{key}"><h2>{title}</h2>{content}</section>' for key, title, content in sections if content
+        f'<section id="{key}"><h2>{title}</h2>{content}</section>'
+        for key, title, content in sections
+        if content
     )
     links = "".join(f'<a href="#{key}">{title}</a>' for key, title, content in sections if content)
     return _page(result, _header(result, found), links, body, plots)
@@ -53,9 +55,7 @@ def render(result: Result) -> str:
 
 def text(value: object) -> str:
     """Return text for HTML: escaped, control characters (other than line breaks) made visible."""
-    clean = "".join(
-        c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in str(value)
-    )
+    clean = "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in str(value))
     return html.escape(clean)
 
 
@@ -118,7 +118,7 @@ def _page(result: Result, header: str, links: str, body: str, plots: _Plots) -> 
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f'<meta name="generator" content="deckfix {__version__}">'
         f"<title>{text(result.flight)} - deckfix</title><style>{style}</style></head><body>"
-        f'<nav><div><b>deckfix</b>{links}</div></nav><main>{header}'
+        f"<nav><div><b>deckfix</b>{links}</div></nav><main>{header}"
         "<noscript><p>The plots need JavaScript; the tables do not.</p></noscript>"
         f"{body}<footer>Written by deckfix {__version__}. This page is complete in itself: it loads nothing "
         "and sends nothing.</footer></main>"
@@ -189,7 +189,8 @@ def _wrong(found: list[Finding]) -> str:
         )
     heads = ("", "symptom", "likely cause", "what to do")
     rows = [
-        (_WORDS[f.severity], [_WORDS[f.severity], text(f.symptom), text(f.cause), text(f.remedy)]) for f in found
+        (_WORDS[f.severity], [_WORDS[f.severity], text(f.symptom), text(f.cause), text(f.remedy)])
+        for f in found
     ]
     return _table(heads, rows, css="findings")
 
@@ -239,10 +240,17 @@ def _ratio_table(result: Result) -> str:
     for name, quantity, axes in RATIOS:
         if name not in ratios:
             continue
-        factor, unit = {"position_m": (1.0, "m"), "velocity_mps": (1.0, "m/s")}.get(quantity, (180 / np.pi, "deg"))
+        factor, unit = {"position_m": (1.0, "m"), "velocity_mps": (1.0, "m/s")}.get(
+            quantity, (180 / np.pi, "deg")
+        )
         size = np.sqrt(len(axes))
         both = [(rms(getattr(e, quantity)[inside][:, axes]) or 0.0) * factor * size for e in (ours, theirs)]
-        cells = [name.replace("_", " "), f"{both[0]:.3f} {unit}", f"{both[1]:.3f} {unit}", f"{ratios[name]:.2f}"]
+        cells = [
+            name.replace("_", " "),
+            f"{both[0]:.3f} {unit}",
+            f"{both[1]:.3f} {unit}",
+            f"{ratios[name]:.2f}",
+        ]
         rows.append(("", cells))
     if not rows:
         return ""
@@ -325,7 +333,8 @@ def _inputs(result: Result, plots: _Plots) -> str:
     clock = ""
     if result.clocks:
         entries = [
-            ("", [text(name), *(text(_number(v)) for v in values.values())]) for name, values in result.clocks.items()
+            ("", [text(name), *(text(_number(v)) for v in values.values())])
+            for name, values in result.clocks.items()
         ]
         names = list(next(iter(result.clocks.values())))
         clock = "<h3>Clocks</h3>" + _table(("clock", *(text(n.replace("_", " ")) for n in names)), entries)
@@ -350,7 +359,9 @@ def _configuration(result: Result) -> str:
         if not entries:
             continue
         lines = "\n".join(f"{key} = {_shorten(value)}" for key, value in sorted(entries.items()))
-        out.append(f"<details><summary>From the log: {text(name)}</summary><pre>{text(lines[:60_000])}</pre></details>")
+        out.append(
+            f"<details><summary>From the log: {text(name)}</summary><pre>{text(lines[:60_000])}</pre></details>"
+        )
     if result.messages:
         said = "\n".join(
             f"{result.seconds(m.t_ns):9.2f} s  {m.source}: {_shorten(m.text)}" for m in result.messages[:2000]
@@ -364,7 +375,11 @@ def _shorten(value: str, longest: int = 2000) -> str:
 
 
 def _table(
-    heads: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]], *, numeric: tuple[int, ...] = (), css: str = ""
+    heads: Sequence[str],
+    rows: Iterable[tuple[str, Sequence[str]]],
+    *,
+    numeric: tuple[int, ...] = (),
+    css: str = "",
 ) -> str:
     """Return a table of cells that are HTML already; each row comes with its CSS class."""
 
@@ -375,6 +390,7 @@ def _table(
 
     head = "".join(cell("th", i, h) for i, h in enumerate(heads))
     body = "".join(
-        f'<tr class="{kind}">{"".join(cell("td", i, c) for i, c in enumerate(cells))}</tr>' for kind, cells in rows
+        f'<tr class="{kind}">{"".join(cell("td", i, c) for i, c in enumerate(cells))}</tr>'
+        for kind, cells in rows
     )
     return f'<div class="scroll"><table class="{css}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'

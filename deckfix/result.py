@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
     from estimation.estimator import Run
-    from logs.recording import Recording
+    from logs.reader import Flight
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class Result:
 
     ``run`` holds the estimates and the measurements' records; ``t_s`` are seconds from ``start_ns``, the first
     inertial sample. ``truth_errors`` are at the estimates' times; ``at_autopilot`` at the autopilot's; both are
-    None where the log holds no such reference. ``sensors`` are the input as it was recorded, for ``write``.
+    None where the log holds no such reference. ``source`` is the log it came from, for ``write``.
     """
 
     flight: str
@@ -82,7 +82,7 @@ class Result:
     messages: tuple[LogMessage, ...] = ()
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     vibration_mps2: float | None = None
-    sensors: Recording | None = None
+    source: Flight | None = None
 
     @cached_property
     def t_s(self) -> Array:
@@ -93,6 +93,13 @@ class Result:
     def euler_rad(self) -> Array:
         """Roll, pitch, yaw [rad] of the estimates, shape (n, 3)."""
         return quat_to_euler_columns(self.run.quaternion)
+
+    @cached_property
+    def state_values(self) -> Array:
+        """Values (n, k) of the states that ``run.state_names`` names; the attitude as rotation vector."""
+        from deckfix.estimate_log import state_values
+
+        return state_values(self.run)
 
     @property
     def duration_s(self) -> float:
@@ -179,8 +186,8 @@ class Result:
         for i, part in enumerate("wxyz"):
             columns[f"quaternion_{part}"] = self.run.quaternion[:, i]
         for i, name in enumerate(self.run.state_names):
-            columns[f"state {name}"] = self.run.state_values[:, i]
-            columns[f"sigma {name}"] = self.run.state_sigmas[:, i]
+            columns[f"state {name}"] = self.state_values[:, i]
+            columns[f"sigma {name}"] = self.run.sigma[:, i]
         return pandas.DataFrame(columns, index=pandas.Index(self.t_s, name="t_s"))
 
     def figure(self) -> go.Figure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,48 +10,17 @@ import numpy as np
 from deckfix.reference import Column, Trajectory, compare, window
 from deckfix.result import AtReference, LogMessage, Result
 from deckfix.streams import stream
+from estimation.estimator import RECORD_DTYPE, Run
 from estimation.events import Kind
 from estimation.frames import euler_to_quat
 from estimation.outcome import Outcome
+from estimation.state import NOMINAL_SIZE, Layout
+from estimation.config import Config
 
 T0 = 41_550_000_000
 
-RECORD = np.dtype(
-    [
-        ("t_ns", np.int64),
-        ("stamp_ns", np.int64),
-        ("arrival_ns", np.int64),
-        ("sensor", np.int16),
-        ("outcome", np.uint8),
-        ("nis", np.float64),
-        ("dof", np.uint8),
-        ("innovation", np.float64, (3,)),
-        ("sigma", np.float64, (3,)),
-        ("age_s", np.float64),
-    ]
-)
 
-
-@dataclass
-class SyntheticRun:
-    t_ns: Any
-    position_m: Any
-    velocity_mps: Any
-    quaternion: Any
-    covariance: Any
-    gyro_bias: Any
-    accel_bias: Any
-    state_names: tuple[str, ...]
-    state_values: Any
-    state_sigmas: Any
-    records: Any
-    sensors: tuple[str, ...]
-    origin: Any
-    notes: tuple[tuple[int, str], ...]
-    engine: str = "filterpy"
-
-
-def synthetic_run(seed: int = 1, seconds: float = 76.0, rate_hz: float = 50.0) -> tuple[SyntheticRun, Trajectory]:
+def synthetic_run(seed: int = 1, seconds: float = 76.0, rate_hz: float = 50.0) -> tuple[Run, Trajectory]:
     """Return a flight up, along and down with white errors of known sigma, and its truth."""
     rng = np.random.default_rng(seed)
     n = int(seconds * rate_hz)
@@ -69,24 +38,32 @@ def synthetic_run(seed: int = 1, seconds: float = 76.0, rate_hz: float = 50.0) -
     error_q = np.hstack([np.ones((n, 1)), smooth[:, 6:] / 2])
     q_est = np.array([_multiply(a, b) for a, b in zip(q, error_q, strict=True)])
     q_est /= np.linalg.norm(q_est, axis=1, keepdims=True)
-    names = tuple(f"gyro_bias.{a}" for a in "xyz") + tuple(f"accel_bias.{a}" for a in "xyz") + ("baro_bias.h",)
-    walk = np.cumsum(rng.normal(size=(n, 7)), axis=0) * 2e-5
-    decay = np.exp(-s / 15)[:, None] * np.array([4e-3] * 3 + [0.03] * 3 + [2.0]) + 1e-3
-    run = SyntheticRun(
+    layout = Layout.of(Config())
+    walk = np.cumsum(rng.normal(size=(n, 6)), axis=0) * 2e-5
+    measured = position + smooth[:, :3] + np.array([0.3, -0.2, 0.5])
+    nominal = np.zeros((n, NOMINAL_SIZE))
+    nominal[:, 0:3], nominal[:, 3:6], nominal[:, 6:10] = measured, velocity + smooth[:, 3:6], q_est
+    nominal[:, 10:16] = walk
+    run = Run(
+        engine="filterpy",
         t_ns=t,
-        position_m=position + smooth[:, :3] + np.array([0.3, -0.2, 0.5]),
+        position_m=measured,
         velocity_mps=velocity + smooth[:, 3:6],
         quaternion=q_est,
         covariance=np.repeat(np.diag(sigma**2)[None], n, axis=0),
         gyro_bias=walk[:, :3],
         accel_bias=walk[:, 3:6],
-        state_names=names,
-        state_values=walk,
-        state_sigmas=decay,
+        nominal=nominal,
+        sigma=np.exp(-s / 15)[:, None] * 4e-3 + np.full(layout.size, 1e-3),
+        state_names=layout.names,
+        state_units=layout.units,
         records=_records(rng, seconds),
         sensors=("gps_position", "gps_velocity", "barometer", "magnetometer"),
-        origin=np.array([np.deg2rad(54.0), np.deg2rad(7.5), 12.0]),
-        notes=((int(t[0]), "initialised at rest"),),
+        notes=[(int(t[0]), "initialised at rest")],
+        imu_outcomes={Outcome.FUSED: n},
+        origin=(float(np.deg2rad(54.0)), float(np.deg2rad(7.5)), 12.0),
+        declination_rad=0.05,
+        missing="",
     )
     return run, truth
 
@@ -100,7 +77,7 @@ def _records(rng: np.random.Generator, seconds: float) -> Any:
     parts = []
     for sensor, (rate, dof, sigma) in enumerate([(5, 3, 0.7), (5, 3, 0.2), (20, 1, 0.2), (30, 1, 0.06)]):
         n = int(seconds * rate)
-        rows = np.zeros(n, dtype=RECORD)
+        rows = np.zeros(n, dtype=RECORD_DTYPE)
         rows["t_ns"] = T0 + (np.arange(n) / rate * 1e9).astype(np.int64)
         rows["stamp_ns"] = rows["arrival_ns"] = rows["t_ns"]
         rows["sensor"], rows["dof"] = sensor, dof
@@ -126,7 +103,11 @@ def synthetic_result(*, with_truth: bool = True, seed: int = 1, **changes: Any) 
         Column(times, truth.velocity_mps.values[::2] + rng.normal(size=(len(times), 3)) * 0.1),  # type: ignore[union-attr]
         Column(times, truth.quaternion.values[::2]),  # type: ignore[union-attr]
     )
-    events = {"imu": (Kind.IMU, 200.0), "gps_position": (Kind.GPS_POSITION, 5.0), "barometer": (Kind.BAROMETER, 20.0)}
+    events = {
+        "imu": (Kind.IMU, 200.0),
+        "gps_position": (Kind.GPS_POSITION, 5.0),
+        "barometer": (Kind.BAROMETER, 20.0),
+    }
     events["gps_velocity"], events["magnetometer"] = (Kind.GPS_VELOCITY, 5.0), (Kind.MAGNETOMETER, 30.0)
     streams = tuple(
         stream(name, kind, start + (np.arange(0, 76, 1 / rate) * 1e9).astype(np.int64))
@@ -134,7 +115,7 @@ def synthetic_result(*, with_truth: bool = True, seed: int = 1, **changes: Any) 
     )
     result = Result(
         flight="synthetic.mcap",
-        run=run,  # type: ignore[arg-type]
+        run=run,
         streams=streams,
         start_ns=start,
         end_ns=end,

@@ -1,0 +1,251 @@
+"""The command ``deckfix``. Each command imports what it needs when it runs, so that ``--help`` answers at once.
+
+Errors are one line on stderr, ``deckfix: FILE: what is wrong; what to do``; the exit code is 1, or 2 where the
+command line itself is wrong, 130 after Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType
+from typing import Any
+
+import click
+
+from deckfix._version import __version__
+
+_FORCE = click.option("--force", is_flag=True, help="Overwrite output files that exist.")
+
+
+class _Ordered(click.Group):
+    """A group that lists its commands in the order in which they are written here."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of the commands."""
+        return list(self.commands)
+
+
+@click.group(
+    cls=_Ordered,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Start with: deckfix demo",
+)
+@click.version_option(__version__, "-V", "--version", message="deckfix %(version)s")
+def deckfix() -> None:
+    """Estimate the state of a multirotor from its flight log, with honest uncertainty."""
+
+
+@deckfix.command("import")
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option("-o", "--output", required=True, metavar="F.mcap", help="The log to write.")
+@_FORCE
+def import_(files: tuple[str, ...], output: str, force: bool) -> None:
+    """Turn flight logs into one MCAP log.
+
+    Takes ArduPilot .BIN and .log, MAVLink .tlog, PX4 .ulg and ROS 2 .mcap; several files of one flight (a .BIN and
+    its .tlog) are joined by their clocks.
+    """
+    from deckfix.importing import import_flight
+
+    _say(import_flight(files, output, force=force))
+
+
+@deckfix.command()
+@click.argument("file", metavar="F.mcap")
+def info(file: str) -> None:
+    """Show what a log holds: topics, rates, gaps, clocks and what is wrong with it."""
+    from deckfix.info import describe
+
+    _say(describe(file))
+
+
+@deckfix.command()
+@click.argument("file", metavar="F.mcap")
+@click.option("-o", "--output", metavar="OUT.mcap", help="Write sensors, estimates and fusion records.")
+@click.option("--report", "report_path", metavar="R.html", help="Write the report.")
+@click.option("--json", "json_path", metavar="S.json", help="Write the summary; - for standard output.")
+@click.option(
+    "--config", "config_path", metavar="C.toml", help="Configuration (default: the log's own, else built in)."
+)
+@click.option(
+    "--engine", type=click.Choice(["auto", "filterpy", "compiled"]), default="auto", show_default=True,
+    help="auto takes compiled where numba is installed.",
+)  # fmt: skip
+@click.option(
+    "--check", is_flag=True, help="Replay twice and compare with recorded estimates: bytes must be equal."
+)
+@_FORCE
+def replay(  # noqa: PLR0917
+    file: str,
+    output: str | None,
+    report_path: str | None,
+    json_path: str | None,
+    config_path: str | None,
+    engine: str,
+    check: bool,
+    force: bool,
+) -> None:
+    """Run the estimator over a log."""
+    from deckfix.commands import replay_command
+
+    text, equal = replay_command(
+        file, output=output, report=report_path, json_path=json_path, config=config_path, engine=engine,
+        check=check, force=force,
+    )  # fmt: skip
+    _say(text)
+    if not equal:
+        raise SystemExit(1)
+
+
+@deckfix.command()
+@click.argument("file", metavar="F.mcap")
+@click.option("-o", "--output", required=True, metavar="R.html", help="The page to write.")
+@_FORCE
+def report(file: str, output: str, force: bool) -> None:
+    """Write the report of a flight as one HTML page.
+
+    A log without estimates is replayed first, with its own configuration.
+    """
+    from deckfix.commands import report_command
+
+    _say(report_command(file, output, force=force))
+
+
+@deckfix.command()
+@click.argument("file", metavar="F.mcap")
+@click.option("-o", "--output", required=True, metavar="DIR", help="The folder to write to.")
+@click.option(
+    "--format", "kind", type=click.Choice(["csv", "npz", "parquet"]), default="csv", show_default=True,
+    help="parquet needs pyarrow.",
+)  # fmt: skip
+@click.option("--topic", "topics", multiple=True, metavar="T", help="Only this topic (may be repeated).")
+@_FORCE
+def export(file: str, output: str, kind: str, topics: tuple[str, ...], force: bool) -> None:
+    """Write the numeric topics of a log as tables, one file each."""
+    from deckfix.export import export_flight
+
+    _say(export_flight(file, output, kind=kind, topics=topics, force=force))
+
+
+@deckfix.command()
+@click.argument("file", metavar="F.mcap")
+@click.option("-o", "--output", required=True, metavar="G.mcap", help="The log to write.")
+@_FORCE
+def recover(file: str, output: str, force: bool) -> None:
+    """Copy all that is readable of a damaged log, and say what was lost."""
+    from deckfix.importing import recover_flight
+
+    _say(recover_flight(file, output, force=force))
+
+
+@deckfix.command()
+def doctor() -> None:
+    """Check the installation and say what is wrong with it."""
+    from deckfix.doctor import examine
+
+    text, healthy = examine()
+    _say(text)
+    if not healthy:
+        raise SystemExit(1)
+
+
+@deckfix.command()
+@click.option(
+    "-o", "--output", default="demo", show_default=True, metavar="DIR", help="The folder to write to."
+)
+@click.option("--seed", default=1, show_default=True, help="Of the simulated flight.")
+@_FORCE
+def demo(output: str, seed: int, force: bool) -> None:
+    """Simulate a flight, replay it and write the report; needs no data."""
+    from deckfix.demo import run_demo
+
+    _say(run_demo(output, seed=seed, force=force))
+
+
+def _say(text: str) -> None:
+    click.echo(text)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line (``sys.argv`` without arguments) and return its exit code."""
+    _stop_on_termination()
+    try:
+        return int(deckfix.main(args=arguments, prog_name="deckfix", standalone_mode=False) or 0)
+    except click.UsageError as error:
+        command = error.ctx.command_path if error.ctx else "deckfix"
+        return _fail(f"{_one_line(error.format_message()).rstrip('.')}; see {command} --help", 2)
+    except click.ClickException as error:
+        return _fail(error.format_message(), error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        return _fail("interrupted; files that were not finished are not written", 130)
+    except BrokenPipeError:
+        # The reader of the output went away; nothing is left to be said to it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 1
+    except Exception as error:
+        return _fail(*_explained(error))
+
+
+def _explained(error: Exception) -> tuple[str, int]:
+    """Return the one line and the exit code for an error."""
+    if os.environ.get("DECKFIX_TRACEBACK"):
+        import traceback
+
+        traceback.print_exception(error)
+    if isinstance(error, OSError):
+        name = error.filename if error.filename is not None else "input or output"
+        reason = error.strerror or type(error).__name__
+        return f"{name}: {reason.lower()}; check the path, the permissions and the space left", 1
+    if isinstance(error, MemoryError):
+        return "out of memory; use a shorter log, or a machine with more", 1
+    if isinstance(error, _known_errors()):
+        return str(error), 1
+    return (
+        f"internal error ({type(error).__name__}: {error}); please report it with the output of deckfix doctor "
+        "(DECKFIX_TRACEBACK=1 shows where it happened)"
+    ), 1
+
+
+def _known_errors() -> tuple[type[Exception], ...]:
+    """Return the errors whose message is meant for the user."""
+    from deckfix.files import InputError, OutputError
+    from estimation.config import ConfigError
+    from logs.errors import LogError
+
+    return LogError, ConfigError, InputError, OutputError, ImportError
+
+
+def _fail(message: str, code: int) -> int:
+    try:
+        click.echo(f"deckfix: {_one_line(message)}", err=True)
+    except BrokenPipeError:
+        return code
+    return code
+
+
+def _one_line(message: str) -> str:
+    line = " ".join(message.split())
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+
+
+def _stop_on_termination() -> None:
+    """Let SIGTERM unwind as Ctrl-C does, so that half-written files are removed."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    handler: Any = stop
+    try:
+        signal.signal(signal.SIGTERM, handler)
+    except ValueError:
+        # Not the main thread: the caller's own handling stays.
+        return
+
+
+if __name__ == "__main__":
+    sys.exit(main())

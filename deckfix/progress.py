@@ -1,0 +1,34 @@
+"""What a person at a terminal sees while they wait; nothing at all in a pipe."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+@contextmanager
+def working(text: str) -> Iterator[None]:
+    """Show that work is going on while the block runs."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+    from rich.markup import escape
+
+    with Console(stderr=True).status(escape(text)):
+        yield
+
+
+def tracked(items: Iterable[T], text: str, total: int) -> Iterator[T]:
+    """Yield the items with a progress bar."""
+    if not sys.stderr.isatty():
+        yield from items
+        return
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(items, description=text, total=total, console=Console(stderr=True), transient=True)

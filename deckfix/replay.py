@@ -1,0 +1,201 @@
+"""Replay: a log goes through the estimator, and the result is compared with the references that the log holds."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deckfix.reference import (
+    Column,
+    Times,
+    Trajectory,
+    Window,
+    column,
+    compare,
+    contact_time_ns,
+    densest,
+    quaternion_column,
+    window,
+)
+from deckfix.result import AtReference, LogMessage, Result
+from deckfix.streams import streams, vibration_mps2
+from estimation.config import Config, dump_config, load_config, parse_config
+from estimation.estimator import EngineName, Facts, LandingEstimator, Run
+from estimation.events import AUTOPILOT, EventBatch, Kind
+
+if TYPE_CHECKING:
+    from logs.reader import Flight
+    from logs.recording import Series
+
+CONFIG_NAME = "config.toml"
+"""Attachment in which a log carries the configuration that its estimates were made with."""
+
+
+def open(path: str | Path) -> Flight:  # noqa: A001
+    """Open a log for reading; raises ``logs.errors.LogError``."""
+    from logs.reader import open_flight
+
+    return open_flight(path)
+
+
+def replay(
+    flight: Flight | str | Path, config: Config | str | Path | None = None, engine: EngineName = "auto"
+) -> Result:
+    """Run the estimator over a log and return what came out.
+
+    ``config`` is a configuration or the path of one; without it the log's own is used, or else the default.
+    Raises ``logs.errors.LogError`` where the log cannot be read or holds no inertial samples, and
+    ``estimation.config.ConfigError`` for a configuration or an engine that cannot be used.
+    """
+    opened = open(flight) if isinstance(flight, str | Path) else flight
+    settings, source = configuration(opened, config)
+    batch = opened.events()
+    imu = batch.rows["stamp_ns"][batch.rows["kind"] == int(Kind.IMU)]
+    if not len(imu):
+        from logs.errors import LogError
+
+        raise LogError(
+            opened.path, "holds no inertial samples (/imu)", "log the IMU, or import the file that has it"
+        )
+    begin = time.perf_counter()
+    run = LandingEstimator(settings, engine=engine, facts=facts(opened)).run(batch)
+    wall_s = time.perf_counter() - begin
+    return present(opened, run, batch, settings, source, wall_s)
+
+
+def configuration(flight: Flight, config: Config | str | Path | None) -> tuple[Config, str]:
+    """Return the configuration to use and where it comes from, in words."""
+    if isinstance(config, Config):
+        return config, "the configuration given"
+    if config is not None:
+        return load_config(config), f"the configuration in {config}"
+    own = flight.attachments.get(CONFIG_NAME)
+    if own is not None:
+        text = own[1].decode("utf-8", errors="replace")
+        return parse_config(text, f"{flight.path}: its configuration"), "the configuration in the log"
+    return Config(), "the default configuration"
+
+
+def facts(flight: Flight) -> Facts:
+    """Return what the log itself says about the sensors: the inertial filters' delay, the declination."""
+    return Facts(
+        imu_latency_s=_stated(flight, "/imu", "latency_s") or 0.0,
+        declination_rad=_stated(flight, "/magnetic_field", "autopilot_declination_rad"),
+    )
+
+
+def _stated(flight: Flight, topic: str, key: str) -> float | None:
+    for info in flight.topics.get(topic, []):
+        try:
+            value = float(info.metadata[key])
+        except (KeyError, ValueError):
+            continue
+        if np.isfinite(value):
+            return value
+    return None
+
+
+def present(
+    flight: Flight, run: Run, batch: EventBatch, config: Config, source: str, wall_s: float = 0.0
+) -> Result:
+    """Return the result of a run over a log's events, compared with the references in the log."""
+    imu = batch.rows["stamp_ns"][batch.rows["kind"] == int(Kind.IMU)]
+    start_ns, end_ns = int(imu.min()), int(imu.max())
+    offsets = flight.clock_offsets_ns
+    truth = _trajectory(flight, "/truth/odometry", offsets)
+    platform = _trajectory(flight, "/truth/platform", offsets)
+    contact = contact_time_ns(truth, platform) if truth is not None else None
+    autopilot = _trajectory(flight, "/autopilot/odometry", offsets)
+    result = Result(
+        flight=Path(flight.path).name,
+        run=run,
+        streams=streams(batch),
+        start_ns=start_ns,
+        end_ns=end_ns,
+        judged=window(start_ns, end_ns, contact),
+        config_text=dump_config(config),
+        config_source=source,
+        wall_s=wall_s,
+        truth=truth,
+        autopilot=autopilot,
+        problems=tuple(flight.problems),
+        messages=_messages(flight, offsets),
+        metadata={name: dict(entries) for name, entries in flight.metadata.items()},
+        vibration_mps2=vibration_mps2(batch),
+        source=flight,
+    )
+    if truth is not None and len(run.t_ns) > 1:
+        own = (run.t_ns, run.position_m, run.velocity_mps, run.quaternion)
+        result.truth_errors = compare(*own, truth, result.judged, run.covariance)
+        if autopilot is not None:
+            result.at_autopilot = at_reference(run, autopilot, truth, result.judged)
+    return result
+
+
+def at_reference(run: Run, autopilot: Trajectory, truth: Trajectory, judged: Window) -> AtReference | None:
+    """Return both estimates' errors against the truth at the times of the autopilot's estimate."""
+    leading = autopilot.position_m or autopilot.velocity_mps or autopilot.quaternion
+    q_run = quaternion_column(run.t_ns, run.quaternion)
+    ours = Trajectory(column(run.t_ns, run.position_m), column(run.t_ns, run.velocity_mps), q_run)
+    if leading is None or ours.position_m is None:
+        return None
+    t = leading.t_ns
+
+    def errors(
+        source: Trajectory,
+    ) -> tuple[Times, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        nothing = np.full((len(t), 3), np.nan)
+        position = source.position_m.at(t) if source.position_m else nothing
+        velocity = source.velocity_mps.at(t) if source.velocity_mps else nothing
+        return t, position, velocity, source.quaternion_at(t)
+
+    return AtReference(
+        ours=compare(*errors(ours), truth, judged), autopilot=compare(*errors(autopilot), truth, judged)
+    )
+
+
+def _trajectory(flight: Flight, topic: str, offsets: dict[str, int]) -> Trajectory | None:
+    """Return a reference on the inertial clock: of its sources the densest for each quantity."""
+    series = [s for s in flight.series(topic) if len(s)] if topic in flight.topics else []
+    times = [_on_inertial_clock(s, offsets) for s in series]
+    position: list[Column | None] = []
+    velocity: list[Column | None] = []
+    attitude: list[Column | None] = []
+    for s, t in zip(series, times, strict=True):
+        position.append(column(t, s.data["pose_pose_position"]))
+        velocity.append(column(t, s.data["twist_twist_linear"]))
+        attitude.append(quaternion_column(t, s.data["pose_pose_orientation"][:, [3, 0, 1, 2]]))
+    out = Trajectory(densest(position), densest(velocity), densest(attitude))
+    empty = out.position_m is None and out.velocity_mps is None and out.quaternion is None
+    return None if empty else out
+
+
+def _on_inertial_clock(series: Series, offsets: dict[str, int]) -> Times:
+    if series.clock == AUTOPILOT:
+        return series.stamp_ns
+    shift = offsets.get(series.clock, 0) - offsets.get(AUTOPILOT, 0)
+    return series.stamp_ns + shift
+
+
+def _messages(flight: Flight, offsets: dict[str, int]) -> tuple[LogMessage, ...]:
+    """Return the texts in the log, the first 5000; a damaged one is left out (the reader tells of it)."""
+    from logs.errors import LogError
+
+    out: list[LogMessage] = []
+    if "/log" not in flight.topics:
+        return ()
+    base = offsets.get(AUTOPILOT, 0)
+    for message in flight.messages(["/log"]):
+        try:
+            said = message.decoded
+        except LogError:
+            continue
+        level = said.level[0] if isinstance(said.level, bytes) else int(said.level)
+        out.append(LogMessage(message.log_time_ns - base, level, str(said.name), str(said.msg)))
+        if len(out) == 5000:
+            break
+    return tuple(out)
