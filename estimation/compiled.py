@@ -18,13 +18,28 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.extending import register_jitable
+from numba.extending import overload, register_jitable
 
 from estimation import frames, models, parameters, state, update
+from estimation import rows as rows_module
 from estimation.frames import Array
 from estimation.models import measure, right_jacobian, transition
 from estimation.outcome import Outcome
-from estimation.rows import Estimates, FilterState, Int, Rows
+from estimation.rows import (
+    KIND,
+    LATE,
+    OUTCOME,
+    OWN,
+    RESET,
+    RESULT,
+    SENSOR,
+    T_NS,
+    VALUE,
+    Estimates,
+    FilterState,
+    Int,
+    Rows,
+)
 from estimation.state import ATTITUDE, Layout, Offsets, plus
 from estimation.update import MAX_STEP_S, extra_noise, interpolate, locked_out, reset_datum, scatter_update, weight
 
@@ -39,7 +54,7 @@ _IMU = 0
 def _cache_of_these_sources() -> Iterator[None]:
     """Let numba cache what is defined within, in a folder named after the sources that it is compiled from."""
     digest = hashlib.sha256()
-    for module in (frames, models, parameters, state, update):
+    for module in (frames, models, parameters, rows_module, state, update):
         digest.update(Path(inspect.getfile(module)).read_bytes())
     digest.update(Path(__file__).read_bytes())
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -51,10 +66,76 @@ def _cache_of_these_sources() -> Iterator[None]:
         numba.config.CACHE_DIR = before
 
 
+@overload(frames.compose)
+def _compose(a: Array, b: Array) -> Callable[[Array, Array], Array]:
+    """Compile the small product as loops."""
+
+    def product(a: Array, b: Array) -> Array:
+        c = np.empty((3, 3))
+        for i in range(3):
+            for j in range(3):
+                c[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+        return c
+
+    return product
+
+
+@overload(frames.rotate)
+def _rotate(m: Array, v: Array) -> Callable[[Array, Array], Array]:
+    """Compile the small product as loops."""
+
+    def product(m: Array, v: Array) -> Array:
+        u = np.empty(3)
+        for i in range(3):
+            u[i] = m[i, 0] * v[0] + m[i, 1] * v[1] + m[i, 2] * v[2]
+        return u
+
+    return product
+
+
 for _module in (frames, models, state, update):
     for _function in vars(_module).values():
-        if inspect.isfunction(_function) and _function.__module__ == _module.__name__:
+        if (
+            inspect.isfunction(_function)
+            and _function.__module__ == _module.__name__
+            and _function not in (frames.compose, frames.rotate)
+        ):
             register_jitable(_function)
+
+
+def _propagate_covariance(P: Array, F: Array, Q: Array) -> None:
+    """Replace P by F P F' + Q, using that F is the identity but for the nine columns of attitude and biases, the
+    velocity in the position, and a diagonal behind."""
+    n = P.shape[0]
+    dt = F[0, 3]
+    FP = np.empty((n, n))
+    for i in range(9):
+        for j in range(n):
+            FP[i, j] = 0.0 if i >= 6 else P[i, j]
+        if i < 3:
+            for j in range(n):
+                FP[i, j] += dt * P[i + 3, j]
+        for k in range(6, 15 if i < 6 else 12):
+            f = F[i, k]
+            for j in range(n):
+                FP[i, j] += f * P[k, j]
+    for i in range(9, n):
+        f = F[i, i]
+        for j in range(n):
+            FP[i, j] = f * P[i, j]
+    for i in range(n):
+        for j in range(i + 1):
+            if j >= 9:
+                value = FP[i, j] * F[j, j]
+            else:
+                value = 0.0 if j >= 6 else FP[i, j]
+                if j < 3:
+                    value += dt * FP[i, j + 3]
+                for k in range(6, 15 if j < 6 else 12):
+                    value += FP[i, k] * F[j, k]
+            value += Q[i, j]
+            P[i, j] = value
+            P[j, i] = value
 
 
 def _propagate(
@@ -73,22 +154,7 @@ def _propagate(
         middle = a + total * ((k + 0.5) / steps)
         mean = interpolate(imu0, clock[1], imu, t_imu, middle)
         x = transition(x, mean[:3], mean[3:], dt, extra, p, offsets, F, Q)
-        # F is the identity but for the first 15 rows (and a diagonal): only those rows mix.
-        FP = np.empty((n, n))
-        FP[:15, :] = F[:15, :15] @ P[:15, :]
-        for i in range(15, n):
-            for j in range(n):
-                FP[i, j] = F[i, i] * P[i, j]
-        new = np.empty((n, n))
-        new[:, :15] = FP[:, :15] @ F[:15, :15].T
-        for j in range(15, n):
-            for i in range(n):
-                new[i, j] = FP[i, j] * F[j, j]
-        for i in range(n):
-            for j in range(i + 1):
-                value = 0.5 * (new[i, j] + new[j, i]) + Q[i, j]
-                P[i, j] = value
-                P[j, i] = value
+        _propagate_covariance(P, F, Q)
     clock[0] = t
     return x
 
@@ -104,7 +170,7 @@ def _fuse(
     m = measure(kind, value, own, x, gyro, p, offsets, r3, H3, R3)
     if m < 0:
         return -m, 0, x
-    r, H, R = r3[:m], H3[:m], R3[:m, :m].copy()
+    r, H, R = r3[:m], np.ascontiguousarray(H3[:m]), R3[:m, :m].copy()
     PHt = P @ H.T
     S = H @ PHt + R
     nis = r @ np.linalg.solve(S, r)
@@ -142,15 +208,15 @@ def _fuse(
     return outcome, 0, x
 
 
+register_jitable(_propagate_covariance)
 register_jitable(_propagate)
 register_jitable(_fuse)
 
 
 def _advance(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, lock: Array, p: Array, offsets: Offsets,
-    t_ns: Int, kind: Int, sensor: Int, late: Int, value: Array, own: Array, outcome: Int, reset: Int, result: Array,
-    start: int, stop: int, out_t: Int, out_x: Array, out_sigma: Array, out_covariance: Array, count: int,
-    emit_after_ns: int, period_ns: int,
+    ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array, out_sigma: Array,
+    out_covariance: Array, count: int, emit_after_ns: int, period_ns: int,
 ) -> int:  # fmt: skip
     n = P.shape[0]
     F = np.empty((n, n))
@@ -161,17 +227,18 @@ def _advance(
     for i in range(start, stop):
         if following <= i:
             following = i
-            while kind[following] != _IMU:
+            while ints[following, KIND] != _IMU:
                 following += 1
-        t = t_ns[i]
-        imu = value[following]
-        state = _propagate(clock, state, P, imu0, scatter, t, t_ns[following], imu, p, offsets, F, Q)
+        t, t_imu = ints[i, T_NS], ints[following, T_NS]
+        imu = floats[following, VALUE:OWN]
+        state = _propagate(clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q)
         if i < following:
-            gyro = interpolate(imu0, clock[1], imu, t_ns[following], t)[:3]
+            gyro = interpolate(imu0, clock[1], imu, t_imu, t)[:3]
             t_s = (t - clock[2]) * 1e-9
-            outcome[i], reset[i], state = _fuse(
-                state, P, lock[sensor[i]], kind[i], value[i], own[i], gyro, t_s, late[i], p, offsets, H, result[i]
-            )
+            ints[i, OUTCOME], ints[i, RESET], state = _fuse(
+                state, P, lock[ints[i, SENSOR]], ints[i, KIND], floats[i, VALUE:OWN], floats[i, OWN:RESULT], gyro, t_s,
+                ints[i, LATE], p, offsets, H, floats[i, RESULT:],
+            )  # fmt: skip
             continue
         scatter_update(scatter, imu0, imu, (t - clock[1]) * 1e-9)
         new_period = period_ns == 0 or t // period_ns != clock[1] // period_ns
@@ -224,6 +291,6 @@ class CompiledEngine:
         s = self.state
         out.count = _kernel(
             s.clock, s.x, s.P, s.imu, s.scatter, s.lock, self.p, self.layout.offsets,
-            rows.t_ns, rows.kind, rows.sensor, rows.late, rows.value, rows.own, rows.outcome, rows.reset, rows.result,
-            start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.count, emit_after_ns, period_ns,
+            rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.count, emit_after_ns,
+            period_ns,
         )  # fmt: skip

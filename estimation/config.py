@@ -103,13 +103,13 @@ class GpsConfig(_Table):
     lever_arm_m: Annotated[Vector3, _number("antenna relative to the IMU, body FRD", "m")] = (0.0, 0.0, 0.0)
     position_sigma_m: Annotated[
         float, _positive("white horizontal noise where the receiver states none, and its floor", "m")
-    ] = 0.5
+    ] = 0.2
     height_sigma_m: Annotated[
         float, _positive("white vertical noise where the receiver states none, and its floor", "m")
-    ] = 2.0
+    ] = 3.0
     velocity_sigma_mps: Annotated[
         float, _positive("white horizontal velocity noise where none is stated, and its floor", "m/s")
-    ] = 0.15
+    ] = 0.2
     climb_sigma_mps: Annotated[
         float, _positive("white vertical velocity noise where none is stated, and its floor", "m/s")
     ] = 0.3
@@ -122,13 +122,14 @@ class GpsConfig(_Table):
             "what the bias states carry",
             extra={"unit": "-"},
         ),
-    ] = 0.4
+    ] = 0.2
     bias: Annotated[bool, _choice("carry a slowly wandering position error as a state")] = True
-    bias_sigma_m: Annotated[float, _positive("stationary 1-sigma of the horizontal position error", "m")] = 0.5
+    bias_sigma_m: Annotated[float, _positive("stationary 1-sigma of the horizontal position error", "m")] = 0.7
     height_bias_sigma_m: Annotated[
         float, _positive("stationary 1-sigma of the vertical position error", "m")
-    ] = 3.0
-    bias_time_s: Annotated[float, _positive("correlation time of the position error", "s")] = 120.0
+    ] = 4.0
+    bias_time_s: Annotated[float, _positive("correlation time of the horizontal error", "s")] = 120.0
+    height_bias_time_s: Annotated[float, _positive("correlation time of the vertical error", "s")] = 3000.0
     max_accuracy_m: Annotated[
         float, _positive("a fix that states a worse horizontal accuracy is not used", "m")
     ] = 50.0
@@ -149,8 +150,8 @@ class BarometerConfig(_Table):
     latency_s: Annotated[float, _not_negative("age of a reading at its stamp", "s")] = 0.0
     sigma_m: Annotated[float, _positive("white noise of the height", "m")] = 0.15
     bias_walk: Annotated[
-        float, _not_negative("random walk of the offset (weather); 0.02: 0.06 m after 10 s", "m/rts")
-    ] = 0.02
+        float, _not_negative("random walk of the offset (weather); 0.01: 0.03 m after 10 s", "m/rts")
+    ] = 0.01
     bias_sigma_m: Annotated[float, _positive("1-sigma of the offset at start, once aligned", "m")] = 3.0
 
 

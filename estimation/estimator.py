@@ -59,6 +59,9 @@ REWIND_SPAN_NS = 200_000_000
 REWIND_COUNT = 20
 """An inertial clock has gone back when this many samples over this span all are too old."""
 
+LOOK_AHEAD = 1024
+"""Events that a batch is looked through at a time."""
+
 MEASURED_3D = (Kind.GPS_POSITION, Kind.GPS_VELOCITY, Kind.VISION)
 
 
@@ -160,7 +163,7 @@ class LandingEstimator:
     _period_ns: int = field(init=False)
     _past: list[tuple[int, int]] = field(default_factory=list)
     _estimates: list[Estimates] = field(default_factory=list)
-    _records: list[NDArray[np.void]] = field(default_factory=list)
+    _settled: list[Rows] = field(default_factory=list)
     _notes: list[tuple[int, str]] = field(default_factory=list)
     _imu_outcomes: dict[Outcome, int] = field(default_factory=dict)
     _utc_s: float = 0.0
@@ -276,7 +279,7 @@ class LandingEstimator:
 
     def _feed(self, r: Rows) -> None:
         """Take well-formed rows in the order of arrival."""
-        h, n, i = self._history, len(r.t_ns), 0
+        h, n, i = self._history, len(r), 0
         window = h.window_ns
         gap = max(window, int(self.config.imu.gap_s * 1e9))
         is_imu = r.kind == Kind.IMU
@@ -286,15 +289,16 @@ class LandingEstimator:
                 i += 1
                 continue
             assert h.newest_ns is not None
-            t = r.t_ns[i:]
-            imu_t = np.where(is_imu[i:], t, np.iinfo(np.int64).min)
+            t = r.t_ns[i : i + LOOK_AHEAD]
+            imu_here = is_imu[i : i + LOOK_AHEAD]
+            imu_t = np.where(imu_here, t, np.iinfo(np.int64).min)
             newest = np.maximum.accumulate(np.concatenate(([h.newest_ns], imu_t)))[:-1]
-            r.age_ns[i:] = newest - t
+            r.age_ns[i : i + len(t)] = newest - t
             too_old = t < newest - window
-            late = (t < newest) | (is_imu[i:] & (t == newest))
-            jump = is_imu[i:] & (t > newest + gap)
-            stop = np.flatnonzero((late & ~too_old) | (too_old & is_imu[i:]) | jump)
-            b = int(stop[0]) if len(stop) else n - i
+            late = (t < newest) | (imu_here & (t == newest))
+            jump = imu_here & (t > newest + gap)
+            stop = np.flatnonzero((late & ~too_old) | (too_old & imu_here) | jump)
+            b = int(stop[0]) if len(stop) else len(t)
             if b > 0:
                 self._insert(r.take(slice(i, i + b)), newest[:b], too_old[:b])
                 self._advance()
@@ -311,7 +315,7 @@ class LandingEstimator:
                 continue
             # A run of late events: put all in place, rewind once, when the next inertial sample comes.
             more = np.flatnonzero(~(late & ~too_old))
-            e = int(more[0]) if len(more) else n - i
+            e = int(more[0]) if len(more) else len(t)
             group = r.take(slice(i, i + e))
             group.late[:] = 1
             self._insert(group, newest[:e], too_old[:e])
@@ -448,39 +452,41 @@ class LandingEstimator:
         self._settle(rows)
 
     def _settle(self, rows: Rows) -> None:
-        """Keep the final records of rows."""
-        if not len(rows.t_ns):
-            return
+        """Keep rows whose outcome is final."""
+        if len(rows):
+            self._settled.append(rows)
+
+    def _final_records(self) -> NDArray[np.void]:
+        """Turn the rows that were kept into records; count the inertial samples, note the resets."""
+        if not self._settled:
+            return np.empty(0, dtype=RECORD_DTYPE)
+        rows = Rows(np.concatenate([r.ints for r in self._settled]), np.concatenate([r.floats for r in self._settled]))
+        self._settled.clear()
         imu = rows.kind == Kind.IMU
         for outcome, count in zip(*np.unique(rows.outcome[imu], return_counts=True), strict=True):
             key = Outcome.FUSED if outcome == PENDING else Outcome(int(outcome))
             self._imu_outcomes[key] = self._imu_outcomes.get(key, 0) + int(count)
-        kept = np.flatnonzero(~imu | (rows.outcome > Outcome.DOWNWEIGHTED))
-        if not len(kept):
-            return
-        r = rows.take(kept)
-        records = np.zeros(len(kept), dtype=RECORD_DTYPE)
+        r = rows.take(np.flatnonzero(~imu | (rows.outcome > Outcome.DOWNWEIGHTED)))
+        records = np.zeros(len(r), dtype=RECORD_DTYPE)
         records["t_ns"], records["stamp_ns"], records["arrival_ns"] = r.t_ns, r.stamp_ns, r.arrival_ns
         records["sensor"], records["outcome"] = r.sensor, r.outcome
         records["dof"] = r.result[:, 1]
-        compared = r.result[:, 1] > 0
-        records["nis"] = np.where(compared, r.result[:, 0], np.nan)
+        records["nis"] = np.where(r.result[:, 1] > 0, r.result[:, 0], np.nan)
         axis = np.arange(3) < r.result[:, 1:2]
         records["innovation"] = np.where(axis, r.result[:, 2:5], np.nan)
         records["sigma"] = np.where(axis, r.result[:, 5:8], np.nan)
         records["age_s"] = r.age_ns * 1e-9
-        self._records.append(records)
         for i in np.flatnonzero(r.reset):
-            name = self._names.sensors[int(r.sensor[i])]
-            size = float(np.linalg.norm(r.result[i, 2:5]))
-            self._notes.append((int(r.t_ns[i]), f"{name} contradicted the filter for long: moved onto it by {size:.1f} m"))
+            name, size = self._names.sensors[int(r.sensor[i])], float(np.linalg.norm(r.result[i, 2:5]))
+            text = f"{name} contradicted the filter, but not itself, for long: moved onto it by {size:.1f}"
+            self._notes.append((int(r.t_ns[i]), text))
+        return records
 
     def _collect(self) -> tuple[Estimates, NDArray[np.void], list[tuple[int, str]]]:
         estimates = Estimates.concatenate(self._estimates, self.layout.size)
-        records = np.concatenate(self._records) if self._records else np.empty(0, dtype=RECORD_DTYPE)
+        records = self._final_records()
         notes = list(self._notes)
         self._estimates.clear()
-        self._records.clear()
         self._notes.clear()
         return estimates, records, notes
 
@@ -524,7 +530,7 @@ def _choose(engine: EngineName) -> str:
 
 def _malformed(rows: Rows) -> Int:
     """Return for each row the outcome of a measurement that is malformed in itself, or ``PENDING``."""
-    outcome = np.full(len(rows.t_ns), PENDING, dtype=np.int64)
+    outcome = np.full(len(rows), PENDING, dtype=np.int64)
     needed = np.array([6, 0, 3, 2, 1, 3, 4, 1, 3, 1])[rows.kind]
     used = np.arange(6) < needed[:, None]
     outcome[(used & ~np.isfinite(rows.value)).any(axis=1)] = Outcome.REJECTED_NOT_FINITE

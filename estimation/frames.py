@@ -40,6 +40,17 @@ def skew(v: Array) -> Array:
     return m
 
 
+def compose(a: Array, b: Array) -> Array:
+    """Return the product of two (3, 3) matrices; its own function so that compiled code can do without a library
+    call for so small a product."""
+    return a @ b
+
+
+def rotate(m: Array, v: Array) -> Array:
+    """Return the product of a (3, 3) matrix and a vector (3,); see ``compose``."""
+    return m @ v
+
+
 def quat_multiply(a: Array, b: Array) -> Array:
     """Return the Hamilton product a * b of two quaternions (w, x, y, z)."""
     q = np.empty(4)

@@ -56,7 +56,7 @@ class History:
 
     def insert(self, new: Rows) -> Int:
         """Put events where they belong; return the ids of exact repetitions, which are left out."""
-        n = len(new.t_ns)
+        n = len(new)
         if n == 0:
             return np.empty(0, dtype=np.int64)
         place = self.size
@@ -151,7 +151,7 @@ class History:
         self.checkpoints = [(i - count, s) for i, s in self.checkpoints]
 
     def _reserve(self, n: int) -> None:
-        capacity = len(self.rows.t_ns)
+        capacity = len(self.rows)
         if n > capacity:
             grown = Rows.empty(max(n, 2 * capacity))
             grown.write(0, self.rows.take(slice(0, self.size)))

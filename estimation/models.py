@@ -11,8 +11,19 @@ import math
 import numpy as np
 
 from estimation import parameters as par
-from estimation.frames import Array, geodetic_to_ned, quat_conjugate, quat_exp, quat_log, quat_multiply
-from estimation.frames import quat_normalise, quat_to_matrix, skew
+from estimation.frames import (
+    Array,
+    compose,
+    geodetic_to_ned,
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_normalise,
+    quat_to_matrix,
+    rotate,
+    skew,
+)
 from estimation.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -40,13 +51,22 @@ UNUSABLE_NOW = -9
 
 
 def right_jacobian(v: Array) -> Array:
-    """Return J_r(v) with ``exp(v + d) = exp(v) exp(J_r(v) d)`` to first order; shape (3, 3).
-
-    Series to third order, exact to 1e-9 for |v| < 0.02 rad and to 1e-4 for 0.3 rad (Sola, 2017, eq. 183).
-    """
-    s = skew(v)
-    s2 = s @ s
-    return np.eye(3) - 0.5 * s + s2 / 6.0 - (s2 @ s) / 24.0
+    """Return J_r(v) with ``exp(v + d) = exp(v) exp(J_r(v) d)`` to first order; shape (3, 3) (Sola, 2017, eq. 183)."""
+    angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if angle2 < 1e-6:
+        a = 0.5 - angle2 / 24.0
+        b = 1.0 / 6.0 - angle2 / 120.0
+    else:
+        angle = math.sqrt(angle2)
+        a = (1.0 - math.cos(angle)) / angle2
+        b = (angle - math.sin(angle)) / (angle2 * angle)
+    J = skew(v) * -a
+    # [v]x squared is v v' - |v|^2 I.
+    for i in range(3):
+        for j in range(3):
+            J[i, j] += b * v[i] * v[j]
+        J[i, i] += 1.0 - b * angle2
+    return J
 
 
 def transition(
@@ -69,7 +89,7 @@ def transition(
     q_mid = quat_multiply(q, half)
     R_mid = quat_to_matrix(q_mid)
     R_half = quat_to_matrix(half)
-    a = R_mid @ f
+    a = rotate(R_mid, f)
     a[2] += p[par.GRAVITY]
     y = x.copy()
     for i in range(3):
@@ -81,16 +101,16 @@ def transition(
     Q[:, :] = 0.0
     for i in range(n):
         F[i, i] = 1.0
-    A = R_mid @ skew(f)
-    dv_dtheta = -dt * (A @ R_half.T)
-    dv_dbg = (0.5 * dt * dt) * (A @ right_jacobian(0.5 * dt * w))
+    A = compose(R_mid, skew(f))
+    dv_dtheta = -dt * compose(A, R_half.T)
+    dv_dbg = (0.5 * dt * dt) * compose(A, right_jacobian(0.5 * dt * w))
     F[vel : vel + 3, att : att + 3] = dv_dtheta
     F[vel : vel + 3, bg : bg + 3] = dv_dbg
     F[vel : vel + 3, ba : ba + 3] = -dt * R_mid
     F[pos : pos + 3, att : att + 3] = (0.5 * dt) * dv_dtheta
     F[pos : pos + 3, bg : bg + 3] = (0.5 * dt) * dv_dbg
     F[pos : pos + 3, ba : ba + 3] = (-0.5 * dt * dt) * R_mid
-    F[att : att + 3, att : att + 3] = (R_half @ R_half).T
+    F[att : att + 3, att : att + 3] = compose(R_half, R_half).T
     F[att : att + 3, bg : bg + 3] = -dt * right_jacobian(dt * w)
     qa = p[par.ACCEL_NOISE] ** 2 + scatter[0]
     qg = p[par.GYRO_NOISE] ** 2 + scatter[1]
@@ -106,11 +126,12 @@ def transition(
     if offsets[GPS_BIAS] >= 0:
         # First-order Gauss-Markov, exact for any dt.
         b = offsets[GPS_BIAS]
-        decay = math.exp(-dt / p[par.GPS_BIAS_TIME])
         for i in range(3):
+            time = p[par.GPS_BIAS_TIME_V] if i == 2 else p[par.GPS_BIAS_TIME]
+            sigma = p[par.GPS_BIAS_V] if i == 2 else p[par.GPS_BIAS_H]
+            decay = math.exp(-dt / time)
             y[BP0 + i] *= decay
             F[b + i, b + i] = decay
-            sigma = p[par.GPS_BIAS_V] if i == 2 else p[par.GPS_BIAS_H]
             Q[b + i, b + i] = sigma**2 * (1.0 - decay * decay)
     if offsets[BARO_BIAS] >= 0:
         b = offsets[BARO_BIAS]
@@ -168,7 +189,7 @@ def gps_position(
     lever = p[par.GPS_LEVER : par.GPS_LEVER + 3]
     R_nb = quat_to_matrix(x[Q0 : Q0 + 4])
     z = geodetic_to_ned(value[0], value[1], value[2], p[par.ORIGIN : par.ORIGIN + 3])
-    arm = R_nb @ lever
+    arm = rotate(R_nb, lever)
     biased = offsets[GPS_BIAS] >= 0
     fraction = p[par.GPS_WHITE_FRACTION] if biased else 1.0
     for i in range(3):
@@ -177,7 +198,7 @@ def gps_position(
         if biased:
             r[i] -= x[BP0 + i]
             H[i, offsets[GPS_BIAS] + i] = 1.0
-    H[:, offsets[ATTITUDE] : offsets[ATTITUDE] + 3] = -(R_nb @ skew(lever))
+    H[:, offsets[ATTITUDE] : offsets[ATTITUDE] + 3] = -compose(R_nb, skew(lever))
     R[0, 0] = gps_variance(own[0], p[par.GPS_SIGMA_H], fraction)
     R[1, 1] = gps_variance(own[3], p[par.GPS_SIGMA_H], fraction)
     R[2, 2] = gps_variance(own[5], p[par.GPS_SIGMA_V], fraction)
@@ -192,15 +213,15 @@ def gps_velocity(
         return UNUSABLE_NOW
     lever = p[par.GPS_LEVER : par.GPS_LEVER + 3]
     R_nb = quat_to_matrix(x[Q0 : Q0 + 4])
-    swing = skew(gyro - x[BG0 : BG0 + 3]) @ lever
-    arm = R_nb @ swing
+    swing = rotate(skew(gyro - x[BG0 : BG0 + 3]), lever)
+    arm = rotate(R_nb, swing)
     dimension = 3 if value[2] == value[2] else 2
     for i in range(dimension):
         r[i] = value[i] - x[V0 + i] - arm[i]
         H[i, offsets[VELOCITY] + i] = 1.0
     att, bg = offsets[ATTITUDE], offsets[GYRO_BIAS]
-    H[:, att : att + 3] = -(R_nb @ skew(swing))
-    H[:, bg : bg + 3] = R_nb @ skew(lever)
+    H[:, att : att + 3] = -compose(R_nb, skew(swing))
+    H[:, bg : bg + 3] = compose(R_nb, skew(lever))
     R[0, 0] = gps_variance(own[0], p[par.GPS_SIGMA_VH], 1.0)
     R[1, 1] = gps_variance(own[3], p[par.GPS_SIGMA_VH], 1.0)
     R[2, 2] = gps_variance(own[5], p[par.GPS_SIGMA_VV], 1.0)
@@ -223,13 +244,13 @@ def magnetometer(value: Array, x: Array, p: Array, offsets: Offsets, r: Array, H
     if p[par.MAG_USE] == 0.0:
         return UNUSABLE_NOW
     R_nb = quat_to_matrix(x[Q0 : Q0 + 4])
-    m = R_nb @ value[0:3]
+    m = rotate(R_nb, value[0:3])
     horizontal = m[0] * m[0] + m[1] * m[1]
     if not horizontal > 0.01 * (horizontal + m[2] * m[2]):
         return UNUSABLE_NOW  # within 6 deg of the magnetic pole's vertical: no heading in it
     angle = p[par.DECLINATION] - math.atan2(m[1], m[0])
     r[0] = (angle + math.pi) % (2.0 * math.pi) - math.pi
-    D = -(R_nb @ skew(value[0:3]))
+    D = -compose(R_nb, skew(value[0:3]))
     att = offsets[ATTITUDE]
     for j in range(3):
         H[0, att + j] = (-m[1] * D[0, j] + m[0] * D[1, j]) / horizontal
@@ -252,7 +273,7 @@ def attitude(value: Array, x: Array, p: Array, offsets: Offsets, r: Array, H: Ar
     S[0, 0] = p[par.ATTITUDE_TILT] ** 2
     S[1, 1] = S[0, 0]
     S[2, 2] = p[par.ATTITUDE_YAW] ** 2
-    R[:, :] = R_nb.T @ S @ R_nb
+    R[:, :] = compose(R_nb.T, compose(S, R_nb))
     return 3
 
 
@@ -265,12 +286,12 @@ def rangefinder(value: Array, x: Array, p: Array, offsets: Offsets, r: Array, H:
     if cosine < 0.5:
         return UNUSABLE_NOW
     lever = p[par.RANGE_LEVER : par.RANGE_LEVER + 3]
-    height = -x[P0 + 2] - p[par.SURFACE_HEIGHT] - (R_nb @ lever)[2]
+    height = -x[P0 + 2] - p[par.SURFACE_HEIGHT] - rotate(R_nb, lever)[2]
     predicted = height / cosine
     r[0] = value[0] - predicted
     H[0, offsets[POSITION] + 2] = -1.0 / cosine
-    tilt = -(R_nb @ skew(np.array([0.0, 0.0, 1.0])))[2]
-    arm = -(R_nb @ skew(lever))[2]
+    tilt = -compose(R_nb, skew(np.array([0.0, 0.0, 1.0])))[2]
+    arm = -compose(R_nb, skew(lever))[2]
     for j in range(3):
         H[0, offsets[ATTITUDE] + j] = -arm[j] / cosine - predicted / cosine * tilt[j]
     R[0, 0] = p[par.RANGE_SIGMA] ** 2 + (p[par.RANGE_SIGMA_PER_M] * value[0]) ** 2

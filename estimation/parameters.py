@@ -34,6 +34,7 @@ from estimation.frames import Array, normal_gravity
     GPS_BIAS_H,
     GPS_BIAS_V,
     GPS_BIAS_TIME,
+    GPS_BIAS_TIME_V,
     GPS_MAX_ACCURACY,
     GPS_RESET_AFTER,
     BARO_USE,
@@ -59,7 +60,7 @@ from estimation.frames import Array, normal_gravity
     GATE_2,
     GATE_3,
     SIZE,
-) = range(45)
+) = range(46)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,7 @@ def pack_parameters(config: Config, site: Site) -> Array:
     p[GPS_WHITE_FRACTION] = c.gps.white_fraction
     p[GPS_BIAS_H], p[GPS_BIAS_V] = c.gps.bias_sigma_m, c.gps.height_bias_sigma_m
     p[GPS_BIAS_TIME], p[GPS_MAX_ACCURACY] = c.gps.bias_time_s, c.gps.max_accuracy_m
+    p[GPS_BIAS_TIME_V] = c.gps.height_bias_time_s
     p[GPS_RESET_AFTER] = c.gps.reset_after_s
     p[BARO_USE], p[BARO_SIGMA], p[BARO_BIAS_WALK] = c.barometer.use, c.barometer.sigma_m, c.barometer.bias_walk
     p[MAG_USE], p[MAG_SIGMA] = c.magnetometer.use, c.magnetometer.heading_sigma_rad

@@ -16,66 +16,115 @@ PENDING = -1
 """Outcome of a measurement that has not been tried yet."""
 
 
+T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = range(10)
+"""Columns of ``Rows.ints``."""
+VALUE, OWN, RESULT, FLOATS = 0, 6, 12, 20
+"""First columns in ``Rows.floats``, and their number."""
+
+
 @dataclass(slots=True)
 class Rows:
-    """Events as columns of equal length n.
+    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 20), with a view for each column.
 
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
     the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
-    the inertial clock was past the content when it arrived. The engines write ``outcome``, ``reset`` (1 where a lock-out was
-    resolved) and ``result`` (n, 8): NIS, dimension, innovation (3), its predicted sigma (3).
+    the inertial clock was past the content when it arrived. ``value`` and ``own`` (n, 6) are the event's value and
+    covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved) and ``result`` (n, 8):
+    NIS, dimension, innovation (3), its predicted sigma (3).
     """
 
-    t_ns: Int
-    kind: Int
-    sensor: Int
-    id: Int
-    late: Int
-    stamp_ns: Int
-    arrival_ns: Int
-    age_ns: Int
-    value: Array
-    own: Array
-    outcome: Int
-    reset: Int
-    result: Array
+    ints: Int
+    floats: Array
 
     @classmethod
     def empty(cls, n: int) -> Rows:
         """Return n rows, not yet tried."""
-        integers = [np.zeros(n, dtype=np.int64) for _ in range(8)]
-        return cls(
-            *integers,
-            np.zeros((n, 6)),
-            np.zeros((n, 6)),
-            np.full(n, PENDING, dtype=np.int64),
-            np.zeros(n, dtype=np.int64),
-            np.zeros((n, 8)),
-        )
+        rows = cls(np.zeros((n, 10), dtype=np.int64), np.zeros((n, FLOATS)))
+        rows.outcome[:] = PENDING
+        return rows
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.ints)
 
     @property
-    def columns(self) -> tuple[NDArray[np.generic], ...]:
-        """All columns, in the order of the constructor."""
-        return (
-            self.t_ns, self.kind, self.sensor, self.id, self.late, self.stamp_ns, self.arrival_ns, self.age_ns,
-            self.value, self.own, self.outcome, self.reset, self.result,
-        )  # fmt: skip
+    def t_ns(self) -> Int:
+        """Time of the content on the estimator's clock [ns]."""
+        return self.ints[:, T_NS]
+
+    @property
+    def kind(self) -> Int:
+        """``events.Kind``."""
+        return self.ints[:, KIND]
+
+    @property
+    def sensor(self) -> Int:
+        """Index of the sensor's name."""
+        return self.ints[:, SENSOR]
+
+    @property
+    def id(self) -> Int:
+        """Order of arrival."""
+        return self.ints[:, ID]
+
+    @property
+    def late(self) -> Int:
+        """1 where the filter had passed the content."""
+        return self.ints[:, LATE]
+
+    @property
+    def stamp_ns(self) -> Int:
+        """The event's own stamp."""
+        return self.ints[:, STAMP_NS]
+
+    @property
+    def arrival_ns(self) -> Int:
+        """The event's arrival."""
+        return self.ints[:, ARRIVAL_NS]
+
+    @property
+    def age_ns(self) -> Int:
+        """Age of the content at arrival."""
+        return self.ints[:, AGE_NS]
+
+    @property
+    def outcome(self) -> Int:
+        """``Outcome`` or ``PENDING``."""
+        return self.ints[:, OUTCOME]
+
+    @property
+    def reset(self) -> Int:
+        """1 where a lock-out was resolved."""
+        return self.ints[:, RESET]
+
+    @property
+    def value(self) -> Array:
+        """The event's value, (n, 6)."""
+        return self.floats[:, VALUE:OWN]
+
+    @property
+    def own(self) -> Array:
+        """The event's covariance, (n, 6)."""
+        return self.floats[:, OWN:RESULT]
+
+    @property
+    def result(self) -> Array:
+        """NIS, dimension, innovation (3), sigma (3)."""
+        return self.floats[:, RESULT:FLOATS]
 
     def take(self, index: slice | Int) -> Rows:
         """Return the rows of an index: views for a slice, copies for an array."""
-        return Rows(*(c[index] for c in self.columns))  # type: ignore[arg-type]
+        return Rows(self.ints[index], self.floats[index])
 
     def write(self, start: int, other: Rows) -> None:
         """Copy other rows over those that begin at ``start``."""
-        stop = start + len(other.t_ns)
-        for mine, theirs in zip(self.columns, other.columns, strict=True):
-            mine[start:stop] = theirs
+        self.ints[start : start + len(other)] = other.ints
+        self.floats[start : start + len(other)] = other.floats
 
     @staticmethod
     def concatenate(a: Rows, b: Rows) -> Rows:
         """Return the rows of a and then those of b."""
-        pairs = zip(a.columns, b.columns, strict=True)
-        return Rows(*(np.concatenate(pair) for pair in pairs))  # type: ignore[arg-type]
+        return Rows(np.concatenate((a.ints, b.ints)), np.concatenate((a.floats, b.floats)))
 
 
 @dataclass(slots=True)
