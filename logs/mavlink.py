@@ -1,8 +1,8 @@
 """What a MAVLink telemetry log means: the autopilot's sensors and estimate, and what its companion said.
 
 Arrivals are the recorder's (UTC). Stamps are the autopilot's, since boot; a message that carries none is
-stamped with its arrival on the autopilot's clock (metadata ``stamp``). Only one vehicle and one of its boots
-is imported.
+stamped like those that arrived next to it (metadata ``stamp``). Only one vehicle and one of its boots is
+imported.
 """
 
 from __future__ import annotations
@@ -306,7 +306,7 @@ def _truth(autopilot: Autopilot, entries: dict[str, str], undulation: float) -> 
     metadata = {
         "message": "SIM_STATE",
         "origin": "truth_origin",
-        "stamp": "the arrival on the autopilot's clock: late by the link's delay",
+        "stamp": "of the messages that arrived next to it, for it carries none",
     }
     position = ardupilot_positions(places, origin)
     return [odometry_series("/truth/odometry", times, position, velocity, q, metadata)]

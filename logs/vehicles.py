@@ -18,6 +18,7 @@ IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU", "SCALED_IMU2", "SCALED_I
 _ANCHORS = (*IMU_MESSAGES, "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")
 _INVALID_AUTOPILOT = 8
 _RESTART_NS = 1_000_000_000
+_NEIGHBOUR_NS = 50_000_000
 _UNIX_US = 1_000_000_000_000_000
 
 
@@ -84,8 +85,27 @@ class Autopilot:
         return messages.data[keep], Times(stamp[keep], messages.arrival_ns[keep])
 
     def stamped_by_arrival(self, messages: Messages) -> Times:
-        """Return times of messages that carry none: the stamp is the arrival on the autopilot's clock."""
-        return Times(messages.arrival_ns - self.offset_ns, messages.arrival_ns)
+        """Return times of messages that carry none.
+
+        The stamp is that of the message with a stamp that arrived next to it, plus the difference of the two
+        arrivals (an autopilot sends what is due in one burst); where none arrived within 50 ms, the arrival
+        on the autopilot's clock.
+        """
+        stamp = messages.arrival_ns - self.offset_ns
+        found = [t for t in map(self.timed, _ANCHORS) if t is not None]
+        if found and len(messages):
+            arrivals = np.concatenate([times.arrival_ns for _, times in found])
+            order = np.argsort(arrivals, kind="stable")
+            arrivals = arrivals[order]
+            delays = arrivals - np.concatenate([times.stamp_ns for _, times in found])[order]
+            after = np.clip(np.searchsorted(arrivals, messages.arrival_ns), 0, len(arrivals) - 1)
+            before = np.maximum(after - 1, 0)
+            late = np.abs(arrivals[after] - messages.arrival_ns)
+            early = np.abs(arrivals[before] - messages.arrival_ns)
+            nearest = np.where(early < late, before, after)
+            close = np.minimum(early, late) <= _NEIGHBOUR_NS
+            stamp[close] = messages.arrival_ns[close] - delays[nearest[close]]
+        return Times(stamp, messages.arrival_ns)
 
 
 def find_autopilot(log: TelemetryLog, path: str | Path, system: int | None = None) -> Autopilot:
