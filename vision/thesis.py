@@ -2,8 +2,7 @@
 
 It is the baseline that the ring detector is compared with. Where a function departs from print it names the
 erratum. What the thesis assumes stays: the target is equally spaced and seen from above (one Z for all of it,
-erratum 12, and the middle of a box is the middle of the target, erratum 13), the lens has no distortion, and
-every contour that passes the filter belongs to the target (there is no test of nesting, erratum 10).
+erratum 12, and the middle of a box is the middle of the target, erratum 13), and the lens has no distortion.
 """
 
 from __future__ import annotations
@@ -31,8 +30,10 @@ class ContourFilter:
 
     ``k1`` .. ``k4`` widen (4.7) and (4.8), ``min_circumference`` is the T_c of (4.4), ``min_area`` and
     ``max_area`` are the alphas of (4.9), as shares of the image. ``min_contours`` is step 5 of seed 4.3,
-    "greater than 2"; two contours have one distance between them and can be measured, but nothing then tells
-    a target from two red blobs (erratum 11).
+    printed as "greater than 2 (the algorithm needs at least 2)"; two can be measured, if they are the
+    target's (erratum 11). The thesis takes every contour that passes for one; here successive ones must also
+    be concentric, to ``max_offset`` of the smaller one's diameter, and evenly spaced, to a factor
+    ``max_uneven`` (erratum 10). Infinity for both is the thesis as it was.
     """
 
     k1: float = -0.5416
@@ -42,7 +43,9 @@ class ContourFilter:
     min_circumference: float = 100.0
     min_area: float = 0.1 / 100.0
     max_area: float = 20.0 / 100.0
-    min_contours: int = 3
+    min_contours: int = 2
+    max_offset: float = 0.25
+    max_uneven: float = 1.6
 
     def __post_init__(self) -> None:
         if not (self.k1 <= self.k2 and self.k3 <= self.k4):
@@ -53,6 +56,8 @@ class ContourFilter:
             )
         if self.min_contours < 2:
             raise ValueError(f"min_contours: {self.min_contours}; a distance needs two contours")
+        if not (self.max_offset > 0.0 and self.max_uneven >= 1.0):
+            raise ValueError(f"max_offset, max_uneven: {self.max_offset}, {self.max_uneven} let nothing pass")
 
 
 class Extremes(NamedTuple):
@@ -253,6 +258,21 @@ def vehicle_relative(R_nb: ArrayLike, R_cb: ArrayLike, position_cam_m: ArrayLike
     return np.asarray(-np.asarray(R_nb) @ (np.asarray(R_cb).T @ np.asarray(position_cam_m)))
 
 
+def doubt(boxes: list[Extremes], limits: ContourFilter) -> str:
+    """Return why these contours, sorted by size, cannot be one equally spaced target, or nothing (erratum
+    10).
+    """
+    middles = [np.array([b.u_min + b.u_max, b.v_min + b.v_max]) / 2.0 for b in boxes]
+    extents = [0.5 * (b.u_max - b.u_min + b.v_max - b.v_min) + 1.0 for b in boxes]
+    for k in range(1, len(boxes)):
+        if float(np.linalg.norm(middles[k] - middles[k - 1])) > limits.max_offset * extents[k]:
+            return "the contours that pass the filter are not concentric"
+    steps = -np.diff(extents)
+    if steps.size and float(steps.max()) > limits.max_uneven * float(steps.min()):
+        return "the contours that pass the filter are not equally spaced"
+    return ""
+
+
 def thesis_detect(
     camera: Camera,
     target: RingTarget,
@@ -290,6 +310,9 @@ def thesis_detect(
             None, f"{len(passed)} of {len(traced)} contours pass the filter, {chosen.min_contours} needed"
         )
     boxes = [extremes(c) for c in passed]
+    why_not = doubt(boxes, chosen)
+    if why_not:
+        return result(None, why_not)
     depth = mean_depth(
         depth_from_spacings(spacings_u(boxes), spacing, camera.fx),
         depth_from_spacings(spacings_v(boxes), spacing, camera.fy),
