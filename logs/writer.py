@@ -30,6 +30,7 @@ from logs.topics import TOPICS, definition_text
 CLOCKS = "deckfix.clocks"
 PROBLEMS = "deckfix.problems"
 LIBRARY = "deckfix"
+UTC = "utc"
 _SECOND_NS = 1_000_000_000
 _CHUNK_BYTES = 1 << 20
 _INCOMPRESSIBLE = ("CompressedImage", "CompressedVideo")
@@ -170,8 +171,8 @@ class FlightWriter:
         """Write one message of any layout: a mapping (or object) of its fields, the header excepted, or its
         CDR.
 
-        ``stamp_ns`` is the source's, in ``clock`` (the arrival where it is None). For messages given as bytes
-        the header is taken as it is.
+        ``stamp_ns`` is the source's, in ``clock``; without it the message is stamped with its arrival, in the
+        clock ``utc``, whose constant is zero. For messages given as bytes the header is taken as it is.
 
         Raises:
             LogError: the type is unknown, or the message does not fit it.
@@ -180,6 +181,9 @@ class FlightWriter:
         kind = message_type or (known.message_type if known else None)
         if kind is None:
             raise LogError(self.path, f"topic {topic!r} has no message type", "name its message_type")
+        if stamp_ns is None:
+            clock = UTC
+            self.set_clocks({UTC: 0})
         stamp = arrival_ns if stamp_ns is None else stamp_ns
         offset = self._offset(clock, stamp, arrival_ns)
         channel = self._channel(topic, kind, self._clocked(clock, metadata or {}))
