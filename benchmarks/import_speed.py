@@ -1,8 +1,8 @@
 """How fast .BIN logs are decoded and imported, against pymavlink's DFReader in the same process.
 
 Per file and trial, in turn: DFReader reads every message; ``logs.dataflash`` decodes every message into
-columns; ``logs.importer`` imports the log and ``logs.writer`` writes it as MCAP. Times are CPU seconds of this
-process.
+columns; ``logs.importer`` imports the log and ``logs.writer`` writes it as MCAP. Times are CPU seconds of
+this process.
 
     python benchmarks/import_speed.py [FILES] [--trials N] [--json OUT]
 """
