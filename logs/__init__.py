@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from logs.errors import LogError
     from logs.reader import Flight, open_flight
     from logs.recording import Recording, Series
-    from logs.recover import recover
     from logs.topics import TOPICS
     from logs.writer import FlightWriter
 
@@ -21,7 +20,6 @@ _HOMES = {
     "Series": "logs.recording",
     "TOPICS": "logs.topics",
     "open_flight": "logs.reader",
-    "recover": "logs.recover",
 }
 
 __all__ = [
@@ -32,7 +30,6 @@ __all__ = [
     "Recording",
     "Series",
     "open_flight",
-    "recover",
 ]
 
 
