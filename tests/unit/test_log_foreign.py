@@ -33,7 +33,7 @@ def test_all_conformance_files_are_read(data_dir: Path, tmp_path: Path) -> None:
     assert len(files) >= 44
     for file in files:
         flight = open_flight(file)
-        messages, attachments, metadata = COUNTS[file.name.split("-")[0]]
+        messages, attachments, metadata = COUNTS[file.stem.split("-")[0]]
         found = list(flight.messages())
         assert len(found) == messages, file.name
         assert sum(c.count for c in flight.channels) == messages
