@@ -19,8 +19,8 @@ from vision.refine import _INV_SQRT_2PI, Fit, brightness, edge_sides, phi
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-GROWTH_SIGMA_PX = 0.15
-BLUR_LOG_SIGMA = 0.5
+GROWTH_SIGMA_PX = 0.12
+BLUR_LOG_SIGMA = 0.4
 START_BLUR_PX = 0.62
 
 
@@ -51,47 +51,6 @@ def _patch(image: Image, plane: LevelPlane, centre: Array, radius: float, border
     return _Patch(uu, vv, x, y, brightness(image, uu, vv))
 
 
-def fit_area(
-    image: Image,
-    plane: LevelPlane,
-    centre: Array,
-    kappa: float,
-    edges_m: Array,
-    *,
-    margin_m: float,
-    tilt_sigma_rad: float = 0.0,
-    scales: tuple[float, ...] = (0.86, 0.9, 0.95, 1.0, 1.05, 1.1, 1.16),
-) -> Fit | None:
-    """Fit the whole target at once; parameters and result as in ``fit_profiles``.
-
-    ``margin_m`` is the width of white around the outermost edge [m].
-    """
-    unit = float(plane.units_per_pixel(centre[0], centre[1]))
-    patch = _patch(image, plane, centre, kappa * edges_m[0] * max(scales), 4.0)
-    if patch is None:
-        return None
-    fits = []
-    starts = []
-    for scale in scales:
-        state = _State(plane, np.array(centre), kappa * scale, np.zeros(2), START_BLUR_PX, 0.0)
-        equations = _equations(state, patch, edges_m, margin_m, unit, 0.0)
-        if equations is not None:
-            starts.append((equations.mean_square, kappa * scale))
-    starts.sort()
-    for _, start in starts[:2]:
-        state = _State(plane, np.array(centre), start, np.zeros(2), START_BLUR_PX, 0.0)
-        solved = _descend(state, patch, edges_m, margin_m, unit, tilt_sigma_rad)
-        if solved is not None:
-            fits.append((solved.mean_square, len(fits), state, solved))
-    if not fits:
-        return None
-    _, _, state, solved = min(fits)
-    disc = _State(plane, state.centre.copy(), state.kappa, np.zeros(2), state.blur_px, 0.0)
-    plain = _descend(disc, patch, edges_m[:1], margin_m, unit, 0.0)
-    gain = np.inf if plain is None else plain.mean_square / solved.mean_square
-    return _result(state, solved, gain, edges_m, patch)
-
-
 @dataclass(slots=True)
 class _State:
     plane: LevelPlane
@@ -100,6 +59,8 @@ class _State:
     tilt: Array
     blur_px: float
     growth_px: float
+    scale: float = np.inf
+    """Residual beyond which a pixel loses its weight [brightness]; infinite at the start."""
 
 
 @dataclass(slots=True)
@@ -111,151 +72,226 @@ class _Equations:
     weight: Array
     mean_square: float
     contrast: float
-    outer_contrast: float
     rows: Array
     considered: Array
     used: NDArray[np.bool_]
 
 
-N_LINEAR = 7
+def fit_area(
+    image: Image,
+    plane: LevelPlane,
+    centre: Array,
+    kappa: float,
+    edges_m: Array,
+    *,
+    margin_m: float,
+    tilt_sigma_rad: float = 0.0,
+    sectors: int = 1,
+    scales: tuple[float, ...] = (0.86, 0.9, 0.95, 1.0, 1.05, 1.1, 1.16),
+) -> Fit | None:
+    """Fit the whole target at once; parameters and result as in ``fit_profiles``.
 
-
-def _equations(
-    state: _State, patch: _Patch, edges_m: Array, margin_m: float, unit: float, tilt_sigma_rad: float
-) -> _Equations | None:
-    plane, kappa, blur = state.plane, state.kappa, state.blur_px
-    reach = kappa * edges_m[0] + min(3.0 * unit, max(kappa * margin_m - 1.2 * unit, 0.8 * unit))
-    qx, qy = plane.from_rays(patch.x, patch.y, patch.v)
-    ex, ey = qx - state.centre[0], qy - state.centre[1]
-    rho = np.sqrt(ex * ex + ey * ey)
-    used = rho < reach
-    if used.sum() < 24:
+    ``margin_m`` is the width of white around the outermost edge [m]. With ``sectors`` above one each sector has its
+    own light, and pixels that disagree lose their weight: for shadows, glare and things in front of the target.
+    """
+    unit = float(plane.units_per_pixel(centre[0], centre[1]))
+    patch = _patch(image, plane, centre, kappa * edges_m[0] * max(scales), 4.0)
+    if patch is None:
         return None
-    x, y, qx, qy, ex, ey, rho = (a[used] for a in (patch.x, patch.y, qx, qy, ex, ey, rho))
-    value = patch.value[used]
-    rho = np.maximum(rho, 1e-3 * unit)
-    nx, ny = ex / rho, ey / rho
-    r = plane.rotation
-    depth = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-    tangent = nx * qx + ny * qy
-    gx = (nx * r[0, 0] + ny * r[1, 0] - tangent * r[2, 0]) / depth
-    gy = (nx * r[0, 1] + ny * r[1, 1] - tangent * r[2, 1]) / depth
-    slope = np.hypot(gx / plane.camera.fx, gy / plane.camera.fy)
-    width = slope * blur
-    sides = edge_sides(len(edges_m))
-    rk = kappa * edges_m
-    bend = np.minimum((width * width)[:, None] / (2.0 * rk), 0.5 * rk)
-    t = (rho[:, None] - rk + bend - sides * (state.growth_px * slope)[:, None]) / width[:, None]
-    cdf = phi(t) * sides
-    bell = np.exp(-0.5 * t * t) * (_INV_SQRT_2PI * sides)
-    linear = np.empty((len(rho), N_LINEAR))
-    linear[:, 0] = 1.0
-    linear[:, 1] = cdf[:, 0]
-    linear[:, 2] = cdf[:, 1:].sum(axis=1)
-    span = kappa * edges_m[0]
-    both = linear[:, 1] + linear[:, 2]
-    linear[:, 3], linear[:, 4] = ex / span, ey / span
-    linear[:, 5], linear[:, 6] = ex / span * both, ey / span * both
-    n_lin = N_LINEAR
-    if len(edges_m) == 1:
-        linear[:, 2] = 0.0
-    ridge = np.full(n_lin, 1e-9)
-    ridge[3:] = 1e-2
-    # Linear part first, robustly, to have contrasts for the derivatives.
-    weight = np.ones(len(rho))
-    coefficients = np.zeros(n_lin)
-    for _ in range(3):
-        lw = linear * weight[:, None]
-        coefficients = np.linalg.solve(lw.T @ linear + np.diag(ridge), lw.T @ value)
-        rest = value - linear @ coefficients
-        scale = max(1.4826 * float(np.median(np.abs(rest))), 0.5)
-        weight = np.minimum(1.0, 2.5 * scale / np.maximum(np.abs(rest), 1e-9))
-    outer, inner = coefficients[1], coefficients[2]
-    if not (outer > 3.0 and (inner > 3.0 or len(edges_m) == 1)):
+    model = _Model(patch, edges_m, margin_m, unit, sectors, tilt_sigma_rad)
+    starts = []
+    for scale in scales:
+        equations = model.equations(_State(plane, centre, kappa * scale, np.zeros(2), START_BLUR_PX, 0.0))
+        if equations is not None:
+            starts.append((equations.mean_square / equations.contrast**2, kappa * scale))
+    starts.sort()
+    best: tuple[float, _State, _Equations] | None = None
+    for _, start in starts[:2]:
+        state = _State(plane, centre, start, np.zeros(2), START_BLUR_PX, 0.0)
+        solved = model.descend(state)
+        if solved is not None:
+            misfit = solved.mean_square / solved.contrast**2
+            if best is None or misfit < best[0]:
+                best = misfit, state, solved
+    if best is None:
         return None
-    gain = np.full(len(edges_m), inner)
-    gain[0] = outer
-    pull = bell * gain / width[:, None]  # d I / d rho of each edge
-    steep = pull.sum(axis=1)
-    columns = np.empty((len(rho), 7))
-    columns[:, 0] = -steep * nx
-    columns[:, 1] = -steep * ny
-    columns[:, 2] = -(pull * edges_m).sum(axis=1)
-    columns[:, 3] = -steep * (nx * qx * qy + ny * (1.0 + qy * qy))
-    columns[:, 4] = steep * (nx * (1.0 + qx * qx) + ny * qx * qy)
-    columns[:, 5] = -(pull * sides).sum(axis=1) * slope
-    columns[:, 6] = -(pull * (t * width[:, None] - 2.0 * bend)).sum(axis=1)
-    considered = np.empty((len(rho), 3))
-    considered[:, 0] = -steep * (gx * x + gy * y)
-    considered[:, 1] = -steep * gx / plane.camera.fx
-    considered[:, 2] = -steep * gy / plane.camera.fy
-    free = [0, 1, 2, 5, 6] if tilt_sigma_rad == 0.0 else [0, 1, 2, 3, 4, 5, 6]
-    rows = np.concatenate((columns[:, free], linear), axis=1)
-    dof = max(float(weight.sum()) - rows.shape[1], 1.0)
-    variance = max(float((weight * rest * rest).sum()) / dof, 0.08)
-    prior = np.zeros(rows.shape[1])
-    centre_of_prior = np.zeros(rows.shape[1])
-    at = {i: n for n, i in enumerate(free)}
-    prior[at[5]] = variance / GROWTH_SIGMA_PX**2
-    centre_of_prior[at[5]] = -state.growth_px
-    prior[at[6]] = variance / BLUR_LOG_SIGMA**2
-    centre_of_prior[at[6]] = -np.log(blur / START_BLUR_PX)
-    if tilt_sigma_rad > 0.0:
-        for i in (3, 4):
-            prior[at[i]] = variance / tilt_sigma_rad**2
-            centre_of_prior[at[i]] = -state.tilt[i - 3]
-    prior[len(free) :] = ridge
-    rw = rows * weight[:, None]
-    try:
-        inverse = np.linalg.inv(rw.T @ rows + np.diag(prior))
-    except np.linalg.LinAlgError:
-        return None
-    change = inverse @ (rw.T @ rest + prior * centre_of_prior)
-    return _Equations(
-        inverse * variance,
-        change[: len(free)],
-        free,
-        rest,
-        weight,
-        float((weight * rest * rest).sum() / weight.sum()),
-        float(inner),
-        float(outer),
-        rows,
-        considered,
-        used,
-    )
+    _, state, solved = best
+    # The same pixels with the same weights, explained by a disc.
+    disc = _State(state.plane, state.centre, state.kappa, np.zeros(2), state.blur_px, 0.0)
+    plain = _Model(patch, edges_m[:1], margin_m, unit, sectors, 0.0, solved.used, solved.weight).descend(disc)
+    gain = 1.0 if plain is None else plain.mean_square / solved.mean_square
+    return _result(state, solved, gain, edges_m, patch)
 
 
-def _descend(
-    state: _State, patch: _Patch, edges_m: Array, margin_m: float, unit: float, tilt_sigma_rad: float
-) -> _Equations | None:
-    equations = None
-    for _ in range(15):
-        equations = _equations(state, patch, edges_m, margin_m, unit, tilt_sigma_rad)
-        if equations is None:
+@dataclass(slots=True)
+class _Model:
+    """The equations of one patch. ``fixed_pixels`` and ``fixed_weight`` replace the choice of pixels, if given."""
+
+    patch: _Patch
+    edges_m: Array
+    margin_m: float
+    unit: float
+    sectors: int
+    tilt_sigma_rad: float
+    fixed_pixels: NDArray[np.bool_] | None = None
+    fixed_weight: Array | None = None
+
+    def equations(self, state: _State) -> _Equations | None:
+        """Linearise at ``state``; None where the target's contrast is missing."""
+        patch, edges_m = self.patch, self.edges_m
+        plane, kappa, blur = state.plane, state.kappa, state.blur_px
+        white_px = max(kappa * self.margin_m / self.unit - 1.2, 0.8)
+        reach = kappa * edges_m[0] + min(3.0, white_px) * self.unit
+        qx, qy = plane.from_rays(patch.x, patch.y, patch.v)
+        ex, ey = qx - state.centre[0], qy - state.centre[1]
+        rho = np.sqrt(ex * ex + ey * ey)
+        used = rho < reach if self.fixed_pixels is None else self.fixed_pixels
+        if used.sum() < 24:
             return None
-        full = np.zeros(7)
-        full[equations.free] = equations.change
-        size = max(
-            float(np.hypot(full[0], full[1])) / unit,
-            abs(full[2]) * edges_m[0] / unit,
-            abs(full[5]),
-            2.0 * abs(full[6]),
-            float(np.hypot(full[3], full[4])) / 0.1,
+        x, y, qx, qy, ex, ey, rho = (a[used] for a in (patch.x, patch.y, qx, qy, ex, ey, rho))
+        value = patch.value[used]
+        rho = np.maximum(rho, 1e-3 * self.unit)
+        nx, ny = ex / rho, ey / rho
+        r = plane.rotation
+        depth = r[2, 0] * x + r[2, 1] * y + r[2, 2]
+        tangent = nx * qx + ny * qy
+        gx = (nx * r[0, 0] + ny * r[1, 0] - tangent * r[2, 0]) / depth
+        gy = (nx * r[0, 1] + ny * r[1, 1] - tangent * r[2, 1]) / depth
+        slope = np.hypot(gx / plane.camera.fx, gy / plane.camera.fy)
+        width = (slope * blur)[:, None]
+        sides = edge_sides(len(edges_m))
+        rk = kappa * edges_m
+        bend = np.minimum(width * width / (2.0 * rk), 0.5 * rk)
+        t = (rho[:, None] - rk + bend - sides * (state.growth_px * slope)[:, None]) / width
+        cdf = phi(t) * sides
+        bell = np.exp(-0.5 * t * t) * (_INV_SQRT_2PI * sides) / width
+        linear = self._light(ex / (kappa * edges_m[0]), ey / (kappa * edges_m[0]), cdf)
+        n_lin = linear.shape[1]
+        ridge = np.full(n_lin, 1e-3)
+        coefficients, rest, weight, scale = self._solve_light(linear, value, ridge, state.scale)
+        contrast_of_pixel, outer = self._contrasts(linear, cdf, coefficients)
+        contrast = float(np.median(contrast_of_pixel))
+        if not (contrast > 4.0 and contrast + outer > 3.0):
+            return None
+        # d I / d rho of each edge: the outermost one may border on something else than white.
+        pull = bell * contrast_of_pixel[:, None]
+        pull[:, 0] += bell[:, 0] * outer
+        steep = pull.sum(axis=1)
+        columns = np.empty((len(rho), 7))
+        columns[:, 0] = -steep * nx
+        columns[:, 1] = -steep * ny
+        columns[:, 2] = -pull @ edges_m
+        columns[:, 3] = -steep * (nx * qx * qy + ny * (1.0 + qy * qy))
+        columns[:, 4] = steep * (nx * (1.0 + qx * qx) + ny * qx * qy)
+        columns[:, 5] = -(pull @ sides) * slope
+        columns[:, 6] = -(pull * (t * width - 2.0 * bend)).sum(axis=1)
+        considered = np.empty((len(rho), 3))
+        considered[:, 0] = -steep * (gx * x + gy * y)
+        considered[:, 1] = -steep * gx / plane.camera.fx
+        considered[:, 2] = -steep * gy / plane.camera.fy
+        free = [0, 1, 2, 5, 6] if self.tilt_sigma_rad == 0.0 else [0, 1, 2, 3, 4, 5, 6]
+        rows = np.concatenate((columns[:, free], linear), axis=1)
+        total = float(weight.sum())
+        variance = max(float(weight @ (rest * rest)) / max(total - rows.shape[1], 1.0), 0.08)
+        prior, offset = np.zeros(7), np.zeros(7)
+        prior[5], offset[5] = variance / GROWTH_SIGMA_PX**2, -state.growth_px
+        prior[6], offset[6] = variance / BLUR_LOG_SIGMA**2, -np.log(blur / START_BLUR_PX)
+        if self.tilt_sigma_rad > 0.0:
+            prior[3:5], offset[3:5] = variance / self.tilt_sigma_rad**2, -state.tilt
+        precision = np.concatenate((prior[free], ridge))
+        pull_back = np.concatenate((prior[free] * offset[free], np.zeros(n_lin)))
+        rw = rows * weight[:, None]
+        try:
+            inverse = np.linalg.inv(rw.T @ rows + np.diag(precision))
+        except np.linalg.LinAlgError:
+            return None
+        change = inverse @ (rw.T @ rest + pull_back)
+        if np.isfinite(state.scale):
+            state.scale = max(0.6 * state.scale, 3.0 * scale)
+        return _Equations(
+            inverse * variance,
+            change[: len(free)],
+            free,
+            rest,
+            weight,
+            float(weight @ (rest * rest)) / max(total, 1e-9),
+            contrast,
+            rows,
+            considered,
+            used,
         )
-        full *= min(1.0, 0.5 / max(size, 1e-12))
-        state.centre = state.centre + full[:2]
-        state.kappa += full[2]
-        state.growth_px += full[5]
-        state.blur_px = float(np.clip(state.blur_px * np.exp(full[6]), 0.25, 4.0))
-        if tilt_sigma_rad > 0.0:
-            state.tilt = state.tilt + full[3:5]
-            state.plane = state.plane.tilted(rotation_xy(full[3], full[4]))
-        if not (state.kappa > 0.0 and np.isfinite(state.centre).all()):
-            return None
-        if size < 0.003:
-            break
-    return equations
+
+    def _light(self, ex: Array, ey: Array, cdf: Array) -> Array:
+        """Return the columns of everything that is linear: levels, contrasts, and how they vary over the target."""
+        pattern = cdf.sum(axis=1)
+        outermost = cdf[:, 0] if cdf.shape[1] > 1 else np.zeros_like(ex)
+        if self.sectors == 1:
+            return np.stack((np.ones_like(ex), pattern, outermost, ex, ey, ex * pattern, ey * pattern), axis=1)
+        sector = ((np.arctan2(ey, ex) / (2.0 * np.pi) % 1.0) * self.sectors).astype(np.intp) % self.sectors
+        one_hot = np.zeros((len(ex), self.sectors))
+        one_hot[np.arange(len(ex)), sector] = 1.0
+        return np.concatenate((one_hot, one_hot * pattern[:, None], outermost[:, None]), axis=1)
+
+    def _solve_light(
+        self, linear: Array, value: Array, ridge: Array, limit: float
+    ) -> tuple[Array, Array, Array, float]:
+        weight = np.ones(len(value)) if self.fixed_weight is None else self.fixed_weight
+        scale = 0.5
+        for _ in range(1 if self.fixed_weight is not None else 3):
+            lw = linear * weight[:, None]
+            coefficients = np.linalg.solve(lw.T @ linear + np.diag(ridge), lw.T @ value)
+            rest = value - linear @ coefficients
+            if self.fixed_weight is not None:
+                break
+            size = np.abs(rest)
+            scale = max(1.4826 * float(np.median(size)), 0.5)
+            if self.sectors == 1:
+                weight = np.minimum(1.0, 2.5 * scale / np.maximum(size, 1e-9))
+            else:
+                bound = limit if np.isfinite(limit) else 2.5 * scale
+                weight = 1.0 / (1.0 + (rest / bound) ** 4)
+        return coefficients, rest, weight, scale
+
+    def _contrasts(self, linear: Array, cdf: Array, coefficients: Array) -> tuple[Array, float]:
+        """Return the contrast at each pixel and what the outermost edge has in addition."""
+        n = len(linear)
+        if self.sectors == 1:
+            varying = coefficients[1] + linear[:, 3] * coefficients[5] + linear[:, 4] * coefficients[6]
+            return np.maximum(varying, 0.0), float(coefficients[2])
+        s = self.sectors
+        return np.maximum(linear[:n, :s] @ coefficients[s : 2 * s], 0.0), float(coefficients[2 * s])
+
+    def descend(self, state: _State) -> _Equations | None:
+        """Move ``state`` to the best fit and return the equations there."""
+        equations = None
+        if self.sectors > 1:
+            state.scale = 60.0
+        for _ in range(15):
+            equations = self.equations(state)
+            if equations is None:
+                return None
+            full = np.zeros(7)
+            full[equations.free] = equations.change
+            size = max(
+                float(np.hypot(full[0], full[1])) / self.unit,
+                abs(full[2]) * self.edges_m[0] / self.unit,
+                abs(full[5]),
+                2.0 * abs(full[6]),
+                float(np.hypot(full[3], full[4])) / 0.1,
+            )
+            full *= min(1.0, 0.5 / max(size, 1e-12))
+            state.centre = state.centre + full[:2]
+            state.kappa += full[2]
+            state.growth_px += full[5]
+            state.blur_px = float(np.clip(state.blur_px * np.exp(full[6]), 0.25, 4.0))
+            if self.tilt_sigma_rad > 0.0:
+                state.tilt = state.tilt + full[3:5]
+                state.plane = state.plane.tilted(rotation_xy(full[3], full[4]))
+            if not (state.kappa > 0.0 and np.isfinite(state.centre).all()):
+                return None
+            if size < 0.003:
+                break
+        return equations
 
 
 def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patch: _Patch) -> Fit:
@@ -264,14 +300,14 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
     rows = [i for i in free if i < 5]
     covariance = np.zeros((5, 5))
     covariance[np.ix_(rows, rows)] = solved.inverse[np.ix_(at, at)]
-    variance = solved.mean_square
+    total = float(solved.weight.sum())
+    variance = max(solved.mean_square * total / max(total - solved.rows.shape[1], 1.0), 0.08)
     rw = solved.rows * solved.weight[:, None]
-    shift = -(solved.inverse / max(variance, 1e-9)) @ (rw.T @ solved.considered)
+    shift = -(solved.inverse / variance) @ (rw.T @ solved.considered)
     considered = np.zeros((5, 3))
     considered[rows] = shift[at]
-    contrast = min(solved.contrast, solved.outer_contrast)
-    agrees = np.abs(solved.residual) < max(3.5 * np.sqrt(variance), 0.12 * contrast)
-    lines = np.stack((patch.u[solved.used], patch.v[solved.used]), axis=1).astype(np.float64)
+    agrees = np.abs(solved.residual) < max(3.5 * np.sqrt(variance), 0.12 * solved.contrast)
+    points = np.stack((patch.u[solved.used], patch.v[solved.used]), axis=1).astype(np.float64)
     return Fit(
         state.plane,
         state.centre,
@@ -279,7 +315,7 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
         state.tilt,
         covariance,
         considered,
-        float(np.sqrt(variance)) / contrast,
+        float(np.sqrt(variance)) / solved.contrast,
         float(agrees.mean()),
         tuple(range(len(edges_m))),
         state.blur_px,
@@ -288,7 +324,7 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
         int(agrees.sum()),
         len(edges_m),
         3 in free,
-        lines,
+        points,
         agrees,
         True,
     )

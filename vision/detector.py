@@ -36,8 +36,12 @@ FREE_TILT_SIGMA_RAD = 0.6
 THESIS_RELATIVE_SIGMA = 0.07
 """1-sigma per axis of a fix by the thesis's method, as a share of the distance (its reported errors: 6-8 %)."""
 MAX_DECK_TILT_RAD = 0.27
-MIN_GAIN_OVER_DISC = 1.7
-"""How many times worse a plain disc has to fit a target whose rings are not resolved."""
+SMALL_PX = 80.0
+"""Outer diameter below which all pixels of the target are fitted where its edges could not be."""
+MIN_GAIN_OVER_DISC = 3.0
+"""How many times worse a plain disc has to fit than the target."""
+MIN_GAIN_OVER_SMALL_DISC = 1.8
+"""The same where so few pixels show the target that its rings are hardly resolved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,16 +301,7 @@ class TargetDetector:
             else float(np.hypot(self.attitude_sigma_rad, self.deck_tilt_sigma_rad))
         )
         if usable.sum() < min(3, len(self._edges)):
-            small = fit_area(
-                image,
-                plane,
-                hypothesis.centre,
-                hypothesis.kappa,
-                self._edges,
-                margin_m=self._margin_m,
-                tilt_sigma_rad=sigma,
-            )
-            return _judge_area(small)
+            return self._fit_small(image, candidate, sigma)
 
         def fit_with(tilt_sigma_rad: float) -> Fit | None:
             return fit_profiles(
@@ -325,7 +320,36 @@ class TargetDetector:
             tilted = fit_with(AUTO_TILT_SIGMA_RAD)
             if tilted is not None and (fit is None or _clearly_better(tilted, fit)):
                 fit = tilted
-        return _judge_profiles(fit, self.min_share)
+        judged = _judge_profiles(fit, self.min_share)
+        if isinstance(judged, str) and 2.0 * self._edges[0] * to_px < SMALL_PX:
+            small = self._fit_small(image, candidate, sigma)
+            return judged if isinstance(small, str) else small
+        return judged
+
+    def _fit_small(self, image: Image, candidate: _Candidate, tilt_sigma_rad: float) -> Fit | str:
+        """Fit all pixels of a small target: in one light first, then with a light for each sector."""
+        hypothesis = candidate.hypothesis
+        best: Fit | None = None
+        reason = ""
+        for sectors in (1, 8):
+            fit = fit_area(
+                image,
+                candidate.plane,
+                hypothesis.centre,
+                hypothesis.kappa,
+                self._edges,
+                margin_m=self._margin_m,
+                tilt_sigma_rad=tilt_sigma_rad,
+                sectors=sectors,
+            )
+            judged = _judge_area(fit, self.min_share if sectors > 1 else 0.85)
+            if isinstance(judged, str):
+                reason = reason or judged
+            elif best is None or judged.chi2 > best.chi2:
+                best = judged
+            if best is not None and best.chi2 > 8.0 and best.residual_px < 0.06:
+                break
+        return reason if best is None else best
 
     def _fix(self, fits: list[Fit], rotation: Array | None, how: str) -> VisionFix:
         best = max(fits, key=_rank)
@@ -424,12 +448,12 @@ def _judge_profiles(fit: Fit | None, min_share: float) -> Fit | str:
     return fit
 
 
-def _judge_area(fit: Fit | None) -> Fit | str:
+def _judge_area(fit: Fit | None, min_share: float) -> Fit | str:
     if fit is None:
         return "a small red region that is no target"
-    if fit.share < 0.85 or fit.residual_px > 0.12:
+    if fit.share < min_share or fit.residual_px > 0.12:
         return f"a small red region that differs from the target by {fit.residual_px:.0%} of its contrast"
-    if fit.chi2 < MIN_GAIN_OVER_DISC or abs(fit.growth_px) > 0.4 or fit.blur_px > 2.5:
+    if fit.chi2 < (MIN_GAIN_OVER_DISC if fit.count > 150 else MIN_GAIN_OVER_SMALL_DISC):
         return "a small red disc without visible rings"
     if not fit.covariance[2, 2] < (0.1 * fit.kappa) ** 2:
         return "the scale is not observable"

@@ -67,8 +67,7 @@ def halve(image: Image) -> Image:
     """Return the image averaged over blocks of 2x2 pixels; block (i, j) is centred at (2 j + 0.5, 2 i + 0.5)."""
     height, width = image.shape[:2]
     even = image[: height - height % 2, : width - width % 2]
-    half: Image = cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    return half
+    return np.asarray(cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
 
 
 def find_contours(mask: Image, half: bool, min_points: int = 6, max_contours: int = 48) -> Contours:
@@ -191,6 +190,10 @@ def _label(
     score = support / expected * np.minimum(1.0, 0.5 * n_matched)
     lonely = (n_matched < 2) & ~((trial_edge == 0) & (radius[trial_circle] < 25.0 * unit[trial_circle]))
     score[lonely] = 0.0
+    # Nothing red lies outside the outermost edge, about the same centre.
+    outside = (apart < 0.15 * radius[None, :]) & (side[None, :] > 0.0)
+    outside &= radius[None, :] > 1.15 * predicted[:, :1] + unit[None, :]
+    score[outside.any(axis=1)] = 0.0
     hypotheses: list[Hypothesis] = []
     for t in np.argsort(-score, kind="stable"):
         if score[t] <= 0.0 or len(hypotheses) == limit:
