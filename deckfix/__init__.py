@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from deckfix._version import __version__
 
 if TYPE_CHECKING:
-    from deckfix.replay import open, replay  # noqa: A004
+    from deckfix.replay import open, replay
     from deckfix.result import Result
 
 __all__ = ["Result", "__version__", "open", "replay"]

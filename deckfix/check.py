@@ -25,7 +25,8 @@ COMPARED = ("/estimate/odometry", "/estimate/state", "/fusion")
 def check_replay(
     result: Result, config: Config | str | Path | None, engine: EngineName
 ) -> tuple[bool, list[str]]:
-    """Replay a result's log anew, and compare: the files of both replays, and estimates that the log recorded.
+    """Replay a result's log anew, and compare: the files of both replays, and estimates that the log
+    recorded.
 
     Returns whether all are equal, and sentences for the user.
     """

@@ -1,7 +1,8 @@
-"""The command ``deckfix``. Each command imports what it needs when it runs, so that ``--help`` answers at once.
+"""The command ``deckfix``. Each command imports what it needs when it runs, so that ``--help`` answers at
+once.
 
-Errors are one line on stderr, ``deckfix: FILE: what is wrong; what to do``; the exit code is 1, or 2 where the
-command line itself is wrong, 130 after Ctrl-C.
+Errors are one line on stderr, ``deckfix: FILE: what is wrong; what to do``; the exit code is 1, or 2 where
+the command line itself is wrong, 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -41,16 +42,19 @@ def deckfix() -> None:
 @deckfix.command("import")
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option("-o", "--output", required=True, metavar="F.mcap", help="The log to write.")
+@click.option(
+    "--system", type=int, metavar="N", help="MAVLink id of the vehicle, where a .tlog holds several."
+)
 @_FORCE
-def import_(files: tuple[str, ...], output: str, force: bool) -> None:
+def import_(files: tuple[str, ...], output: str, system: int | None, force: bool) -> None:
     """Turn flight logs into one MCAP log.
 
-    Takes ArduPilot .BIN and .log, MAVLink .tlog, PX4 .ulg and ROS 2 .mcap; several files of one flight (a .BIN and
-    its .tlog) are joined by their clocks.
+    Takes ArduPilot .BIN and .log, MAVLink .tlog, PX4 .ulg and ROS 2 .mcap; several files of one flight (a
+    .BIN and its .tlog) are joined by their clocks.
     """
     from deckfix.importing import import_flight
 
-    _say(import_flight(files, output, force=force))
+    _say(import_flight(files, output, system=system, force=force))
 
 
 @deckfix.command()
@@ -78,7 +82,7 @@ def info(file: str) -> None:
     "--check", is_flag=True, help="Replay twice and compare with recorded estimates: bytes must be equal."
 )
 @_FORCE
-def replay(  # noqa: PLR0917
+def replay(
     file: str,
     output: str | None,
     report_path: str | None,
@@ -206,8 +210,8 @@ def _explained(error: Exception) -> tuple[str, int]:
     if isinstance(error, _known_errors()):
         return str(error), 1
     return (
-        f"internal error ({type(error).__name__}: {error}); please report it with the output of deckfix doctor "
-        "(DECKFIX_TRACEBACK=1 shows where it happened)"
+        f"internal error ({type(error).__name__}: {error}); please report it with the output of "
+        "deckfix doctor (DECKFIX_TRACEBACK=1 shows where it happened)"
     ), 1
 
 

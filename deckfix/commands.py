@@ -46,7 +46,7 @@ def replay_command(
     document = json.dumps(finite(result.summary()), indent=1) + "\n"
     if json_path and not to_stdout:
         write_text(json_path, document, force=force, inputs=inputs)
-    equal, verdict = True, []
+    equal, verdict = True, list[str]()
     if check:
         from deckfix.check import check_replay
 
@@ -93,11 +93,11 @@ def digest(result: Result) -> str:
     from estimation.outcome import Outcome
 
     found = findings(result)
-    n, records = len(result.run.t_ns), result.run.records
+    n, records = len(result.run.t_ns), result.tried
     fused = int(np.count_nonzero(records["outcome"] <= int(Outcome.DOWNWEIGHTED)))
     lines = [
-        f"{result.flight}: {result.duration_s:.1f} s, {n} estimates, {fused} of {len(records)} measurements fused "
-        f"({result.run.engine}, {result.wall_s:.2f} s)",
+        f"{result.flight}: {result.duration_s:.1f} s, {n} estimates, "
+        f"{fused} of {len(records)} measurements fused ({result.run.engine}, {result.wall_s:.2f} s)",
         verdict(result, found),
     ]
     lines += [

@@ -18,8 +18,8 @@ PACKAGES = ("estimation", "vision", "logs", "simulation", "deckfix")
 """The top-level packages of this distribution."""
 
 REQUIRED = (
-    "numpy", "scipy", "filterpy", "opencv-python-headless", "pymavlink", "mcap", "mcap-ros2-support", "msgspec",
-    "click", "rich", "joblib", "plotly", "pygeomag",
+    "numpy", "scipy", "filterpy", "opencv-python-headless", "pymavlink", "mcap", "mcap-ros2-support",
+    "msgspec", "click", "rich", "joblib", "plotly", "pygeomag",
 )  # fmt: skip
 OPTIONAL = {
     "numba": "the compiled engine (deckfix[fast])",
@@ -83,7 +83,9 @@ def _version(name: str) -> str | None:
 
 
 def _names() -> Iterable[Check]:
-    """Check that the names ``estimation``, ``vision``, ``logs``, ``simulation`` mean this product's packages."""
+    """Check that the names ``estimation``, ``vision``, ``logs``, ``simulation`` mean this product's
+    packages.
+    """
     home = Path(__file__).resolve().parent.parent
     owners = metadata.packages_distributions()
     for name in PACKAGES:

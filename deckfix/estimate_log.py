@@ -36,8 +36,8 @@ def write(
 ) -> None:
     """Write a result's log and estimates to an MCAP file.
 
-    Raises ``deckfix.files.OutputError`` where the file may not be written, and ``ValueError`` for a result that
-    did not come from a log.
+    Raises ``deckfix.files.OutputError`` where the file may not be written, and ``ValueError`` for a result
+    that did not come from a log.
     """
     from deckfix.replay import CONFIG_NAME
     from logs.writer import FlightWriter
@@ -56,7 +56,9 @@ def write(
 
 
 def copy_source(flight: Flight, writer: FlightWriter) -> None:
-    """Copy metadata, attachments and messages of a log, in the order of their arrival, without our own topics."""
+    """Copy metadata, attachments and messages of a log, in the order of their arrival, without our own
+    topics.
+    """
     from deckfix.replay import CONFIG_NAME
     from logs.writer import CLOCKS
 
@@ -84,33 +86,32 @@ def copy_source(flight: Flight, writer: FlightWriter) -> None:
 
 
 def estimate_series(run: Run, utc_offset_ns: int) -> list[Series]:
-    """Return the topics of a run: odometry, the whole state, and one series of fusion records a sensor."""
-    out = [odometry_series(run, utc_offset_ns), state_series(run, utc_offset_ns)] if len(run.t_ns) else []
-    return out + fusion_series(run)
+    """Return the topics of a run: odometry, the whole state, and one series of fusion records a sensor.
 
+    Fusion records are stamped with the time of their content and logged at their arrival; ``utc_offset_ns``
+    takes the inertial clock to UTC.
+    """
+    from logs.estimates import fusion_series, odometry_series, state_series
 
-def odometry_series(run: Run, utc_offset_ns: int) -> Series:
-    """Return ``/estimate/odometry``: NED pose and velocity with their covariances, body-frame for the rotation."""
-    from logs.recording import Series
-    from logs.topics import TOPICS, new_rows
-
-    topic = TOPICS["/estimate/odometry"]
-    rows = new_rows(topic.name, len(run.t_ns))
-    rows["pose_pose_position"] = run.position_m
-    rows["pose_pose_orientation"] = run.quaternion[:, [1, 2, 3, 0]]
-    pose = [0, 1, 2, 6, 7, 8]
-    rows["pose_covariance"] = run.covariance[:, pose][:, :, pose].reshape(-1, 36)
-    twist = np.zeros((len(run.t_ns), 6, 6))
-    twist[:, :3, :3] = run.covariance[:, 3:6, 3:6]
-    rows["twist_twist_linear"] = run.velocity_mps
-    rows["twist_covariance"] = twist.reshape(-1, 36)
-    return Series(
-        topic.name, run.t_ns, run.t_ns + utc_offset_ns, rows, AUTOPILOT, topic.frame_id, dict(topic.strings)
-    )
+    out = []
+    if len(run.t_ns):
+        arrival = run.t_ns + utc_offset_ns
+        pose = (run.position_m, run.velocity_mps, run.quaternion, run.covariance)
+        out.append(odometry_series("/estimate/odometry", run.t_ns, arrival, *pose))
+        out.append(state_series(run.state_names, run.t_ns, arrival, state_values(run), run.sigma))
+    for index in np.unique(run.records["sensor"]):
+        r = run.records[run.records["sensor"] == index]
+        told = (r["outcome"].astype(np.uint8), r["nis"], r["dof"].astype(np.uint8))
+        name = run.sensors[int(index)]
+        rest = (r["innovation"], r["sigma"], r["age_s"])
+        out.append(fusion_series(name, r["t_ns"], r["arrival_ns"], *told, *rest))
+    return out
 
 
 def state_values(run: Run) -> NDArray[np.float64]:
-    """Return the values (n, k) of the states that ``run.state_names`` names; the attitude as rotation vector."""
+    """Return the values (n, k) of the states that ``run.state_names`` names; the attitude as rotation
+    vector.
+    """
     identity = np.zeros_like(run.quaternion)
     identity[:, 0] = 1.0
     attitude = rotation_vector_columns(identity, run.quaternion)
@@ -121,33 +122,3 @@ def state_values(run: Run) -> NDArray[np.float64]:
         place = BLOCKS[number][1].index(component)
         values[:, i] = attitude[:, place] if number == ATTITUDE else run.nominal[:, NOMINAL[number] + place]
     return values
-
-
-def state_series(run: Run, utc_offset_ns: int) -> Series:
-    """Return ``/estimate/state``: every state with its sigma."""
-    from logs.recording import Series
-    from logs.topics import TOPICS, new_rows
-
-    topic, size = TOPICS["/estimate/state"], len(run.state_names)
-    rows = new_rows(topic.name, len(run.t_ns), values=size, sigmas=size)
-    rows["values"], rows["sigmas"] = state_values(run), run.sigma
-    names = {f"names_{i}": name for i, name in enumerate(run.state_names)}
-    return Series(topic.name, run.t_ns, run.t_ns + utc_offset_ns, rows, AUTOPILOT, topic.frame_id, names)
-
-
-def fusion_series(run: Run) -> list[Series]:
-    """Return ``/fusion``, one series a sensor: stamped with the time of the content, logged at its arrival."""
-    from logs.recording import Series
-    from logs.topics import new_rows
-
-    out = []
-    for index in np.unique(run.records["sensor"]):
-        records = run.records[run.records["sensor"] == index]
-        rows = new_rows("/fusion", len(records))
-        for name in ("outcome", "nis", "dof", "innovation", "sigma", "age_s"):
-            rows[name] = records[name]
-        name = run.sensors[int(index)]
-        out.append(
-            Series("/fusion", records["t_ns"], records["arrival_ns"], rows, AUTOPILOT, "", {"sensor": name})
-        )
-    return out

@@ -29,7 +29,8 @@ def export_flight(
 ) -> str:
     """Write each numeric topic of a log to a file in ``folder``, and return what there is to say.
 
-    Raises ``InputError`` for a topic that is not in the log, ``OutputError`` for files that may not be written.
+    Raises ``InputError`` for a topic that is not in the log, ``OutputError`` for files that may not be
+    written.
     """
     from logs.reader import open_flight
 
@@ -65,7 +66,9 @@ def export_flight(
 
 
 def columns(series: Series) -> dict[str, NDArray[Any]]:
-    """Return a series as flat columns: stamp and arrival, then each field, arrays as ``name_0``, ``name_1``..."""
+    """Return a series as flat columns: stamp and arrival, then each field, arrays as ``name_0``,
+    ``name_1``...
+    """
     out: dict[str, NDArray[Any]] = {"stamp_ns": series.stamp_ns, "arrival_ns": series.arrival_ns}
     for name in series.data.dtype.names or ():
         values = series.data[name]
@@ -99,7 +102,9 @@ def _tables(flight: Flight, topic: str) -> list[Series] | None:
 
 
 def _names(topic: str, series: list[Series]) -> list[str]:
-    """Return a file name for each series of a topic: the topic's, and a sensor or number where there are several."""
+    """Return a file name for each series of a topic: the topic's, and a sensor or number where there are
+    several.
+    """
     base = _safe(topic.strip("/").replace("/", "_")) or "topic"
     if len(series) == 1:
         return [base]

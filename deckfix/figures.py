@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,6 @@ from deckfix.plotting import (
     Trace,
     axis,
     band,
-    decimate,
     label,
     layout,
     limits,
@@ -27,7 +27,7 @@ from deckfix.plotting import (
     rgba,
     stacked,
 )
-from deckfix.reference import euler_sigmas
+from deckfix.reference import Trajectory, euler_sigmas
 from deckfix.result import Result, nis_band
 from estimation.events import Kind
 from estimation.outcome import Outcome
@@ -84,14 +84,19 @@ def track(result: Result) -> Figure:
 
 def height(result: Result) -> Figure:
     """Return the height above the origin over time."""
-    axes = {"xaxis": axis(SECONDS), "yaxis": axis("height above origin [m]")}
+    up = -result.run.position_m[:, 2]
+    shown = limits(up, share=100.0)
+    axes = {"xaxis": _time_axis(result), "yaxis": axis("height above origin [m]")}
+    if shown is not None:
+        margin = 0.15 * (shown[1] - shown[0])
+        axes["yaxis"]["range"] = [shown[0] - margin, shown[1] + margin]
     figure: Figure = {"data": _height_traces(result, 1, legend=True), "layout": layout(420, **axes)}
     figure["layout"]["shapes"] = _contact_shapes(result)
     return figure
 
 
 def position(result: Result) -> Figure:
-    """Return the position's errors with their 3 sigma band, or the position itself where no truth is known."""
+    """Return the position's errors with their 3 sigma band, or the position itself without a truth."""
     return _three_panels(result, _curves(result, "position"))
 
 
@@ -111,31 +116,38 @@ def innovations(result: Result, sensor: str) -> Figure:
     records = records[np.isfinite(records["nis"]) & (records["dof"] > 0)]
     kind = next((s.kind for s in result.streams if s.name == sensor), Kind.USER)
     unit, names = INNOVATION_UNITS.get(kind, ("own unit", ("1", "2", "3")))
-    t = (records["t_ns"] - result.start_ns) * 1e-9
+    t = result.seconds_of(records["t_ns"])
     dof = int(records["dof"].max()) if len(records) else 1
     data: list[Trace] = []
     for i in range(dof):
         name = names[i] if i < len(names) else str(i + 1)
         sigma = 3.0 * records["sigma"][:, i]
-        data += band(t, -sigma, sigma, f"±3 sigma {name}", 1, colour=AXES[i % 3], legend=dof == 1)
+        if dof == 1:
+            data += band(t, -sigma, sigma, "±3 sigma", 1)
+        else:
+            for k, bound in enumerate((-sigma, sigma)):
+                edge = line(t, bound, "±3 sigma", AXES[i % 3], 1, legend=i == k == 0, width=1, dash="dot")
+                data.append(edge | {"hoverinfo": "skip"})
         data.append(points(t, records["innovation"][:, i], name, AXES[i % 3], 1, size=3.5))
     low, high = (float(v[0]) for v in nis_band(np.array([float(dof)])))
     refused = records["outcome"] > int(Outcome.DOWNWEIGHTED)
-    nis = np.maximum(records["nis"], 1e-3)
+    nis = np.maximum(records["nis"], 1e-9)
     data.append(points(t[~refused], nis[~refused], "NIS", GREY, 2, size=3))
     if refused.any():
         data.append(points(t[refused], nis[refused], "NIS of rejected", BAD, 2, size=5, symbol="x"))
     if len(t) >= 20:
-        data.append(line(t, _running_mean(records["nis"], 41), "NIS, mean of 41", TRUTH, 2, width=1.6))
+        data.append(line(t, _running_mean(nis, 41), "NIS, mean of 41", TRUTH, 2, width=1.6))
     reach = limits(
         *(records["innovation"][:, i] for i in range(dof)),
         *(3.0 * np.nanmedian(records["sigma"][:, i : i + 1], axis=0) for i in range(dof)),
         share=99.0,
         symmetric=True,
     )
-    axes = stacked([f"innovation [{unit}]", "NIS"], [reach, None], SECONDS)
-    top = max(float(np.log10(np.percentile(nis, 99.9))) if len(nis) else 1.0, np.log10(high) + 0.4)
-    axes["yaxis2"] |= {"type": "log", "range": [np.log10(low) - 0.7, top + 0.1], "dtick": 1}
+    axes = stacked([f"innovation [{unit}]", "NIS"], [reach, None], SECONDS, result.duration_s)
+    spread = np.log10(np.percentile(nis, (3.0, 99.9))) if len(nis) else np.zeros(2)
+    bottom = max(min(np.log10(low) - 0.3, float(spread[0])), -4.0)
+    top = max(float(spread[1]) + 0.2, np.log10(high) + 0.4)
+    axes["yaxis2"] |= {"type": "log", "range": [bottom, top], "dtick": 1}
     shape = {
         "type": "rect", "xref": "x2 domain", "yref": "y2", "x0": 0, "x1": 1, "y0": low, "y1": high,
         "fillcolor": rgba("#2a7f62", 0.13), "line": {"width": 0}, "layer": "below",
@@ -145,8 +157,8 @@ def innovations(result: Result, sensor: str) -> Figure:
 
 def outcomes(result: Result) -> Figure:
     """Return how many measurements met each outcome, stacked over time."""
-    records = result.run.records
-    t = (records["t_ns"] - result.start_ns) * 1e-9
+    records = result.tried
+    t = result.seconds_of(records["t_ns"])
     end = max(result.duration_s, 1.0)
     width = max(1.0, np.ceil(end / 90.0))
     edges = np.arange(0.0, end + width, width)
@@ -166,7 +178,7 @@ def outcomes(result: Result) -> Figure:
                 "marker": {"color": OUTCOME_COLOURS[outcome], "line": {"width": 0}},
             }
         )
-    axes = {"xaxis": axis(SECONDS), "yaxis": axis("measurements per second")}
+    axes = {"xaxis": _time_axis(result), "yaxis": axis("measurements per second")}
     return {"data": data, "layout": layout(330, barmode="stack", bargap=0, hovermode="x unified", **axes)}
 
 
@@ -187,7 +199,10 @@ def states(result: Result, block: str) -> Figure:
         ranges.append(limits(value, (value - sigma)[late], (value + sigma)[late]))
         component = result.run.state_names[i].split(".")[-1]
         titles.append(f"{label(component)} [{unit}]")
-    return {"data": data, "layout": layout(90 + 100 * len(chosen), **stacked(titles, ranges, SECONDS))}
+    return {
+        "data": data,
+        "layout": layout(90 + 100 * len(chosen), **stacked(titles, ranges, SECONDS, result.duration_s)),
+    }
 
 
 def coverage(result: Result) -> Figure:
@@ -217,7 +232,7 @@ def coverage(result: Result) -> Figure:
             }
         )
     axes = {
-        "xaxis": axis(SECONDS),
+        "xaxis": _time_axis(result),
         "yaxis": axis(
             "",
             tickvals=list(range(len(names))),
@@ -263,7 +278,7 @@ def _track_traces(result: Result, axes: int) -> list[Trace]:
     return data
 
 
-def _path(xyz: Array, name: str, colour: str, axes: int, **style: object) -> Trace:
+def _path(xyz: Array, name: str, colour: str, axes: int, **style: Any) -> Trace:
     step = max(1, len(xyz) // 2400)
     trace = line(np.zeros(0), np.zeros(0), name, colour, axes, **style)
     return trace | {"x": xyz[::step, 1].astype(np.float32), "y": xyz[::step, 0].astype(np.float32)}
@@ -280,10 +295,10 @@ def _height_traces(result: Result, axes: int, *, legend: bool) -> list[Trace]:
     return data
 
 
-def _others(result: Result) -> list[tuple[str, tuple[Array, Array], str, dict[str, object]]]:
+def _others(result: Result) -> list[tuple[str, tuple[Array, Array], str, dict[str, Any]]]:
     """Return name, (seconds, positions in the estimate's datum), colour and style of each reference."""
-    out: list[tuple[str, tuple[Array, Array], str, dict[str, object]]] = []
-    known = (
+    out: list[tuple[str, tuple[Array, Array], str, dict[str, Any]]] = []
+    known: tuple[tuple[str, Trajectory | None, str, dict[str, Any]], ...] = (
         ("truth", result.truth, TRUTH, {"dash": "dot"}),
         ("autopilot", result.autopilot, AUTOPILOT, {}),
     )
@@ -295,7 +310,7 @@ def _others(result: Result) -> list[tuple[str, tuple[Array, Array], str, dict[st
             np.nanmedian(result.run.position_m - own.at(result.run.t_ns), axis=0) if len(result.t_s) else 0.0
         )
         shifted = own.values + np.where(np.isfinite(datum), datum, 0.0)
-        out.append((name, ((own.t_ns - result.start_ns) * 1e-9, shifted), colour, dict(style)))
+        out.append((name, (result.seconds_of(own.t_ns), shifted), colour, dict(style)))
     return out
 
 
@@ -320,7 +335,7 @@ def _curves(result: Result, quantity: str) -> _Curves:
         theirs = result.at_autopilot.autopilot if result.at_autopilot is not None else None
         return _Curves(
             names, unit, ours, sigma * factor, np.zeros_like(ours),
-            None if theirs is None else (theirs.t_ns - result.start_ns) * 1e-9,
+            None if theirs is None else result.seconds_of(theirs.t_ns),
             None if theirs is None else getattr(theirs, field) * factor,
             True,
         )  # fmt: skip
@@ -345,14 +360,14 @@ def _autopilot_values(result: Result, quantity: str) -> tuple[Array | None, Arra
     if quantity == "velocity":
         if reference.velocity_mps is None:
             return None, None
-        return (reference.velocity_mps.t_ns - result.start_ns) * 1e-9, reference.velocity_mps.values
+        return result.seconds_of(reference.velocity_mps.t_ns), reference.velocity_mps.values
     if reference.quaternion is None:
         return None, None
     from estimation.frames import quat_to_euler_columns
 
     angles = quat_to_euler_columns(reference.quaternion_at(reference.quaternion.t_ns))
     angles = np.unwrap(angles, axis=0)
-    seconds = (reference.quaternion.t_ns - result.start_ns) * 1e-9
+    seconds = result.seconds_of(reference.quaternion.t_ns)
     # Whole turns between the two unwrapped yaws say nothing.
     ours = np.interp(seconds, result.t_s, np.unwrap(result.euler_rad[:, 2]))
     angles[:, 2] += 2.0 * np.pi * np.round(np.median(ours - angles[:, 2]) / (2.0 * np.pi))
@@ -370,10 +385,17 @@ def _ranges(result: Result, curves: _Curves) -> list[tuple[float, float] | None]
         typical = 3.0 * np.nanmedian(curves.sigma[:, i : i + 1], axis=0) if len(curves.sigma) else np.zeros(0)
         if curves.are_errors:
             judged = result.judged.inside(result.run.t_ns)
-            shown = [curves.ours[judged, i], typical]
+            shown = [curves.ours[judged, i]]
             if curves.autopilot is not None:
                 shown.append(curves.autopilot[:, i])
-            out.append(limits(*shown, symmetric=True))
+            reach = limits(*shown, symmetric=True)
+            wide = limits(*shown, typical, symmetric=True)
+            # A band far wider than the errors would leave nothing of them to see.
+            out.append(
+                wide
+                if reach is None or wide is None
+                else (-min(wide[1], 5 * reach[1]), min(wide[1], 5 * reach[1]))
+            )
         else:
             shown = [curves.ours[:, i], curves.ours[:, i] - typical, curves.ours[:, i] + typical]
             out.append(limits(*shown))
@@ -396,7 +418,7 @@ def _curve_traces(result: Result, curves: _Curves, first_axes: int, *, legend: b
 
 
 def _three_panels(result: Result, curves: _Curves) -> Figure:
-    axes = stacked(_titles(curves), _ranges(result, curves), SECONDS)
+    axes = stacked(_titles(curves), _ranges(result, curves), SECONDS, result.duration_s)
     shapes = [s for row in (1, 2, 3) for s in _contact_shapes(result, row)]
     return {
         "data": _curve_traces(result, curves, 1, legend=True),
@@ -412,10 +434,15 @@ def _contact_shapes(result: Result, row: int = 1) -> list[dict[str, object]]:
     suffix = "" if row == 1 else str(row)
     return [
         {
-            "type": "line", "xref": f"x{suffix}", "yref": f"y{suffix} domain", "x0": t, "x1": t, "y0": 0, "y1": 1,
+            "type": "line", "xref": f"x{suffix}", "yref": f"y{suffix} domain",
+            "x0": t, "x1": t, "y0": 0, "y1": 1,
             "line": {"color": GREY, "width": 1, "dash": "dash"},
         }
     ]  # fmt: skip
+
+
+def _time_axis(result: Result) -> dict[str, object]:
+    return axis(SECONDS, range=[0.0, max(result.duration_s, 1e-3)])
 
 
 def _block_unit(block: str) -> tuple[str, float]:

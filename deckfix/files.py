@@ -1,4 +1,6 @@
-"""Output files: written beside their place and moved there when they are whole, never over another by accident."""
+"""Output files: written beside their place and moved there when they are whole, never over another by
+accident.
+"""
 
 from __future__ import annotations
 
@@ -52,10 +54,11 @@ def check_output(path: str | Path, *, force: bool, inputs: Sequence[str | Path] 
 def output_file(
     path: str | Path, *, force: bool = False, inputs: Sequence[str | Path] = ()
 ) -> Iterator[Path]:
-    """Give a temporary path beside ``path``; it takes its place when the block ends well, else it is removed.
+    """Give a temporary path beside ``path``; it takes its place when the block ends well, else it is
+    removed.
 
-    Raises ``OutputError`` as ``check_output`` does, before the block is entered; without ``force`` a file that
-    has appeared meanwhile is not overwritten either.
+    Raises ``OutputError`` as ``check_output`` does, before the block is entered; without ``force`` a file
+    that has appeared meanwhile is not overwritten either.
     """
     target = check_output(path, force=force, inputs=inputs)
     partial = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")

@@ -34,7 +34,7 @@ class Finding:
 _REMEDIES: dict[Outcome, tuple[str, str]] = {
     Outcome.REJECTED_GATE: (
         "an outlier of the sensor, a wrong latency or lever arm, or a noise configured too small",
-        "look at its innovations below: a constant offset is calibration or latency, single peaks are outliers",
+        "look at its innovations: a constant offset is calibration or latency, single peaks are outliers",
     ),
     Outcome.REJECTED_NOT_FINITE: (
         "the source wrote NaN or infinity",
@@ -98,7 +98,8 @@ def verdict(result: Result, found: list[Finding]) -> str:
             f"Do not rely on this estimate before looking at the {_count(serious, 'serious finding')} below."
         )
     if warnings:
-        return f"The estimate is usable; {_count(warnings, 'thing')} deserve{'s' if warnings == 1 else ''} a look."
+        deserve = "deserves" if warnings == 1 else "deserve"
+        return f"The estimate is usable; {_count(warnings, 'thing')} {deserve} a look."
     return "The estimate is consistent with its sensors; nothing went wrong that can be seen from the log."
 
 
@@ -112,10 +113,11 @@ def _percent(share: float) -> str:
 
 def _readiness(result: Result) -> Iterator[Finding]:
     if not len(result.run.t_ns):
+        waited = f"it waited for {result.run.missing}" if result.run.missing else "it never became ready"
         yield Finding(
             Severity.SERIOUS,
             "no estimate came out",
-            "the filter needs inertial samples, a good GPS fix and a heading before it starts",
+            f"the filter needs inertial samples, a good GPS fix and a heading before it starts; {waited}",
             "see the sensors below: which of them is missing or rejected?",
         )
         return
@@ -129,10 +131,16 @@ def _readiness(result: Result) -> Iterator[Finding]:
         )
 
 
+_GRAVE = ("lost", "damaged", "backwards", "went back", "reset", "two vehicles", "fails", "cannot be decoded")
+_HARMLESS = ("ends within a message",)
+
+
 def _problems(result: Result) -> Iterator[Finding]:
     for problem in result.problems[:20]:
+        low = problem.lower()
+        grave = any(w in low for w in _GRAVE) and not any(w in low for w in _HARMLESS)
         yield Finding(
-            Severity.WARNING,
+            Severity.WARNING if grave else Severity.NOTE,
             problem,
             "the file, or the recording, is incomplete or unusual",
             "what could be read was used; if the loss matters, copy the log again from its source",
@@ -146,17 +154,25 @@ def _problems(result: Result) -> Iterator[Finding]:
         )
 
 
+_ALARMING = ("no inertial sample", "went back", "aligning again", "contradicted", "diverg", "lost")
+
+
 def _notes(result: Result) -> Iterator[Finding]:
-    for t_ns, text in result.run.notes[:30]:
-        low = text.lower()
-        alarming = any(w in low for w in ("gap", "re-init", "reset", "lock", "lost", "diverg", "backwards"))
+    """Tell the filter's notes of trouble; the others are listed with the outcomes."""
+    alarming = [(t, n) for t, n in result.run.notes if any(w in n.lower() for w in _ALARMING)]
+    for t_ns, text in alarming[:20]:
         yield Finding(
-            Severity.WARNING if alarming else Severity.NOTE,
+            Severity.WARNING,
             f"at {result.seconds(int(t_ns)):.1f} s: {text}",
-            "the filter's own note"
-            if not alarming
-            else "inertial data or fixes that the filter could not bridge",
-            "compare with the sensors' coverage below" if alarming else "nothing to do",
+            "inertial data or fixes were missing, or contradicted each other for long",
+            "compare with the sensors' coverage and outcomes at that time",
+        )
+    if len(alarming) > 20:
+        yield Finding(
+            Severity.WARNING,
+            f"{len(alarming) - 20} further notes of this kind from the filter",
+            "as above",
+            "as above",
         )
 
 
@@ -202,32 +218,22 @@ def _inputs(result: Result) -> Iterator[Finding]:
 
 
 def _outcomes(result: Result) -> Iterator[Finding]:
-    ready_ns = int(result.run.t_ns[0]) if len(result.run.t_ns) else None
     for sensor in result.measured:
-        records = result.sensor_records(sensor)
-        if ready_ns is not None:
-            records = records[records["t_ns"] >= ready_ns]
-        total = len(records)
-        if not total:
+        if sensor in result.unused:
             continue
+        records = result.tried[result.tried["sensor"] == result.run.sensors.index(sensor)]
+        total = len(records)
         for outcome, (cause, remedy) in _REMEDIES.items():
             n = int(np.count_nonzero(records["outcome"] == int(outcome)))
-            share = n / total
             harmless = outcome is Outcome.REJECTED_DUPLICATE
-            if n < 3 or share < (0.05 if harmless else 0.01):
+            if n < 3 or n / total < (0.05 if harmless else 0.01):
                 continue
-            severity = Severity.NOTE
-            if not harmless:
-                severity = (
-                    Severity.WARNING
-                    if share < 0.5 or outcome is Outcome.REJECTED_NOT_READY
-                    else Severity.SERIOUS
-                )
-            if outcome is Outcome.REJECTED_NOT_READY and share > 0.99:
-                severity = Severity.NOTE
+            severity = Severity.NOTE if harmless else Severity.WARNING
+            if n / total >= 0.5 and outcome not in (Outcome.REJECTED_DUPLICATE, Outcome.REJECTED_NOT_READY):
+                severity = Severity.SERIOUS
             yield Finding(
                 severity,
-                f"{sensor}: {n} of {total} ({_percent(share)}) rejected: {EXPLANATIONS[outcome]}",
+                f"{sensor}: {n} of {total} ({_percent(n / total)}) rejected: {EXPLANATIONS[outcome]}",
                 cause,
                 remedy,
             )
@@ -243,7 +249,7 @@ def _consistency(result: Result) -> Iterator[Finding]:
             yield Finding(
                 Severity.SERIOUS if mean > 6.0 else Severity.WARNING,
                 f"{sensor}: innovations are {np.sqrt(mean):.1f} times larger than expected",
-                "its noise is configured too small, its latency or calibration is wrong, or it disagrees with others",
+                "its noise is set too small, its latency or calibration is wrong, or it contradicts others",
                 "raise its sigma, or find the offset in its innovations",
             )
         elif mean < 0.2:
@@ -263,7 +269,7 @@ def _consistency(result: Result) -> Iterator[Finding]:
                 yield Finding(
                     Severity.WARNING,
                     f"errors against the truth are {np.sqrt(mean):.1f} times what the covariance says",
-                    "errors that last longer than the filter assumes (GPS wander, magnetic field), or noise set too small",
+                    "errors that last longer than the filter assumes (GPS wander), or noise set too small",
                     "raise the noise of the sensor whose innovations are largest",
                 )
 
@@ -336,7 +342,7 @@ def _messages(result: Result) -> Iterator[Finding]:
     for message in errors[:10]:
         yield Finding(
             Severity.NOTE,
-            f"at {result.seconds(message.t_ns):.1f} s {message.source or 'the autopilot'} said: {message.text}",
+            f"at {result.seconds(message.t_ns):.1f} s {message.source or 'autopilot'} said: {message.text}",
             "the autopilot's own message of level error or above",
             "see the autopilot's documentation",
         )

@@ -9,10 +9,13 @@ from deckfix.files import existing, output_file
 from deckfix.progress import working
 
 
-def import_flight(files: Sequence[str | Path], output: str | Path, *, force: bool = False) -> str:
+def import_flight(
+    files: Sequence[str | Path], output: str | Path, *, system: int | None = None, force: bool = False
+) -> str:
     """Write the log of one flight from its files, and return what there is to say.
 
-    Raises ``logs.errors.LogError`` for files that cannot be read, ``deckfix.files.OutputError`` for the output.
+    Raises ``logs.errors.LogError`` for files that cannot be read, ``deckfix.files.OutputError`` for the
+    output.
     """
     from logs.importer import import_files
     from logs.writer import FlightWriter
@@ -20,7 +23,7 @@ def import_flight(files: Sequence[str | Path], output: str | Path, *, force: boo
     paths = [existing(f) for f in files]
     with output_file(output, force=force, inputs=paths) as partial:
         with working(f"importing {', '.join(p.name for p in paths)}"):
-            recording = import_files(paths)
+            recording = import_files(paths, system)
         with working(f"writing {Path(output).name}"), FlightWriter(partial, force=True) as writer:
             writer.write_recording(recording)
         size = partial.stat().st_size
@@ -39,8 +42,9 @@ def recover_flight(file: str | Path, output: str | Path, *, force: bool = False)
 
     source = existing(file)
     with output_file(output, force=force, inputs=[source]) as partial, working(f"recovering {source.name}"):
-        told = recover(source, partial)
-    return f"wrote {output}\n{told}"
+        told = recover(source, partial, force=True)
+    lines = [f"wrote {output}: {told.summary()}", *(f"  {p}" for p in told.problems)]
+    return "\n".join(_printable(line) for line in lines)
 
 
 def _printable(line: str) -> str:

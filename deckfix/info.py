@@ -14,7 +14,8 @@ from deckfix.streams import stream
 from estimation.events import Kind
 
 if TYPE_CHECKING:
-    from logs.reader import ChannelInfo, Flight
+    from logs.channels import ChannelInfo
+    from logs.reader import Flight
 
 
 def describe(path: str | Path) -> str:
@@ -37,11 +38,9 @@ def describe(path: str | Path) -> str:
         for info in infos:
             rate = _rate_hz(info)
             shown = f"{rate:.1f} Hz" if rate else ""
-            gaps = _gaps(flight, topic) if len(infos) == 1 else None
+            gaps = _gaps(flight, topic) if len(infos) == 1 else ""
             kind = info.message_type or info.message_encoding
-            lines.append(
-                f"{topic:<28} {info.count:>9,} {shown:>9} {'' if gaps is None else gaps:>5}  {kind} ({info.clock})"
-            )
+            lines.append(f"{topic:<28} {info.count:>9,} {shown:>9} {gaps:>5}  {kind} ({info.clock})")
     offsets = flight.clock_offsets_ns
     if offsets:
         lines += ["", "clocks (constant that takes their stamps to UTC)"]
@@ -66,14 +65,14 @@ def _rate_hz(info: ChannelInfo) -> float | None:
     return (info.count - 1) / (info.last_ns - info.first_ns) * 1e9
 
 
-def _gaps(flight: Flight, topic: str) -> int | None:
-    """Return the number of gaps in a sensor's or reference's stamps; None for other topics."""
+def _gaps(flight: Flight, topic: str) -> str:
+    """Return the number of gaps in a sensor's or reference's stamps; nothing for other topics."""
     from logs.events import EVENT_TOPICS
 
     if topic not in EVENT_TOPICS and not topic.startswith(("/truth/", "/autopilot/")):
-        return None
+        return ""
     stamps = [s.stamp_ns for s in flight.series(topic)]
-    return len(stream(topic, Kind.USER, np.concatenate(stamps)).gaps) if stamps else None
+    return str(len(stream(topic, Kind.USER, np.concatenate(stamps)).gaps)) if stamps else ""
 
 
 def _utc(t_ns: int) -> str:

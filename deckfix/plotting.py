@@ -1,7 +1,8 @@
-"""Parts of plotly figures, as plain dictionaries: lines, bands, axes, and decimation that keeps the extremes.
+"""Parts of plotly figures, as plain dictionaries: lines, bands, axes, and decimation that keeps the
+extremes.
 
-A figure is ``{"data": [...], "layout": {...}}``; arrays in it are float32 NumPy arrays. Text that comes from a log
-passes through ``label``, since plotly reads a little HTML in the text it is given.
+A figure is ``{"data": [...], "layout": {...}}``; arrays in it are float32 NumPy arrays. Text that comes
+from a log passes through ``label``, since plotly reads a little HTML in the text it is given.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def label(text: str, longest: int = 60) -> str:
 
 
 def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
-    """Return at most 2 ``buckets`` points of a curve: the lowest and the highest of each bucket, in their order.
+    """Return at most 2 ``buckets`` points of a curve: the lowest and the highest of each bucket, in their
+    order.
 
     ``x`` and ``y`` are (n,); NaN in ``y`` are kept as gaps only in buckets that hold nothing else.
     """
@@ -145,15 +147,7 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
         "paper_bgcolor": "#ffffff",
         "plot_bgcolor": "#ffffff",
         "font": {"family": FONT, "size": 12, "color": INK},
-        "legend": {
-            "orientation": "h",
-            "x": 0,
-            "y": 1,
-            "yanchor": "bottom",
-            "yref": "container",
-            "font": {"size": 12},
-        }
-        | {"y": 0.995, "yanchor": "top"},
+        "legend": {"orientation": "h", "x": 0, "y": 0.995, "yanchor": "top", "yref": "container"},
         "hovermode": "x",
         "hoverlabel": {"font": {"family": FONT, "size": 12}},
         "dragmode": "zoom",
@@ -162,9 +156,11 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
 
 
 def stacked(
-    titles: Sequence[str], ranges: Sequence[tuple[float, float] | None], x_title: str
+    titles: Sequence[str], ranges: Sequence[tuple[float, float] | None], x_title: str, end: float
 ) -> dict[str, Any]:
-    """Return axes for panels one above the other that share their time axis, the first on top."""
+    """Return axes for panels one above the other that share their time axis, 0 to ``end``, the first on
+    top.
+    """
     n = len(titles)
     gap = 0.035 if n > 1 else 0.0
     tall = (1.0 - gap * (n - 1)) / n
@@ -177,7 +173,7 @@ def stacked(
             x_title if last else "",
             anchor=f"y{suffix}",
             showticklabels=last,
-            **({} if i == 0 else {"matches": "x"}),
+            **({"range": [0.0, max(end, 1e-3)]} if i == 0 else {"matches": "x"}),
         )
         y = axis(title, anchor=f"x{suffix}", domain=[max(0.0, top - tall), top])
         if limits is not None:

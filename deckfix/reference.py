@@ -1,7 +1,7 @@
 """Comparison of an estimate with a reference: the truth, or the autopilot's own estimate.
 
-All times are int64 nanoseconds on the clock of the inertial sensor; positions, velocities and their errors are
-NED, attitude errors are differences of roll, pitch and yaw wrapped to [-pi, pi).
+All times are int64 nanoseconds on the clock of the inertial sensor; positions, velocities and their errors
+are NED, attitude errors are differences of roll, pitch and yaw wrapped to [-pi, pi).
 """
 
 from __future__ import annotations
@@ -105,9 +105,9 @@ def densest(columns: Sequence[Column | None]) -> Column | None:
 class Errors:
     """An estimate less a reference at the times ``t_ns`` (m,); NaN where the reference gives nothing.
 
-    ``position_m`` (m, 3) is less its constant ``datum_m`` (3,), the median over the window; ``velocity_mps``
-    (m, 3); ``attitude_rad`` (m, 3) roll, pitch, yaw; ``nees`` (m,) of position, velocity and attitude (9 degrees
-    of freedom; 6 or 3 where the reference lacks a part, see ``nees_dof``).
+    ``position_m`` (m, 3) is less its constant ``datum_m`` (3,), the median over the window;
+    ``velocity_mps`` (m, 3); ``attitude_rad`` (m, 3) roll, pitch, yaw; ``nees`` (m,) of position, velocity
+    and attitude (9 degrees of freedom; 6 or 3 where the reference lacks a part, see ``nees_dof``).
     """
 
     t_ns: Times
@@ -144,10 +144,10 @@ def window(start_ns: int, end_ns: int, contact_ns: int | None) -> Window:
 def contact_time_ns(truth: Trajectory, platform: Trajectory | None = None) -> int | None:
     """Return when the vehicle touched down, from the truth alone; None where it did not.
 
-    After the highest point: the most abrupt arrest of the descent, if the downward velocity falls by at least
-    0.25 m/s within 50 ms (twice what rotors can do; true of any contact that is not a feather's, deck moving or
-    not). Without one: the first time from which the height above the starting level, or above the platform
-    where its truth is given, stays below 0.12 m.
+    After the highest point: the most abrupt arrest of the descent, if the downward velocity falls by at
+    least 0.25 m/s within 50 ms (twice what rotors can do; true of any contact that is not a feather's, deck
+    moving or not). Without one: the first time from which the height above the starting level, or above the
+    platform where its truth is given, stays below 0.12 m.
     """
     if truth.position_m is None:
         return None
@@ -183,8 +183,9 @@ def compare(
 ) -> Errors:
     """Return an estimate's errors against a reference, which is interpolated to the estimate's times.
 
-    ``position_m`` and ``velocity_mps`` are (n, 3), ``quaternion`` (n, 4) w x y z; ``covariance`` (n, 9, 9) is of
-    position, velocity and the rotation vector in the body frame (true attitude = estimate x exp(vector)).
+    ``position_m`` and ``velocity_mps`` are (n, 3), ``quaternion`` (n, 4) w x y z; ``covariance`` (n, 9, 9)
+    is of position, velocity and the rotation vector in the body frame (true attitude = estimate x
+    exp(vector)).
     """
     nothing = np.full((len(t_ns), 3), np.nan)
     position = position_m - reference.position_m.at(t_ns) if reference.position_m else nothing
@@ -247,8 +248,8 @@ def nees(error: Array, covariance: Array) -> tuple[Array, int]:
 def euler_sigmas(quaternion: Array, rotation_covariance: Array) -> Array:
     """Return 1-sigma of roll, pitch, yaw [rad], shape (n, 3), of a body-frame rotation vector's covariance.
 
-    First order: d(roll, pitch, yaw) = E(roll, pitch) d(rotation vector), with E the matrix that takes body rates
-    to Euler rates; near pitch = +-90 deg it grows without bound, as the angles themselves do.
+    First order: d(roll, pitch, yaw) = E(roll, pitch) d(rotation vector), with E the matrix that takes body
+    rates to Euler rates; near pitch = +-90 deg it grows without bound, as the angles themselves do.
     """
     e = quat_to_euler_columns(quaternion)
     sr, cr = np.sin(e[:, 0]), np.cos(e[:, 0])

@@ -1,4 +1,6 @@
-"""Replay: a log goes through the estimator, and the result is compared with the references that the log holds."""
+"""Replay: a log goes through the estimator, and the result is compared with the references that the log
+holds.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ CONFIG_NAME = "config.toml"
 """Attachment in which a log carries the configuration that its estimates were made with."""
 
 
-def open(path: str | Path) -> Flight:  # noqa: A001
+def open(path: str | Path) -> Flight:
     """Open a log for reading; raises ``logs.errors.LogError``."""
     from logs.reader import open_flight
 
@@ -167,11 +169,21 @@ def _trajectory(flight: Flight, topic: str, offsets: dict[str, int]) -> Trajecto
     attitude: list[Column | None] = []
     for s, t in zip(series, times, strict=True):
         position.append(column(t, s.data["pose_pose_position"]))
-        velocity.append(column(t, s.data["twist_twist_linear"]))
+        velocity.append(column(t, _velocity_ned(s)))
         attitude.append(quaternion_column(t, s.data["pose_pose_orientation"][:, [3, 0, 1, 2]]))
     out = Trajectory(densest(position), densest(velocity), densest(attitude))
     empty = out.position_m is None and out.velocity_mps is None and out.quaternion is None
     return None if empty else out
+
+
+def _velocity_ned(series: Series) -> NDArray[np.float64]:
+    """Return the velocities (n, 3) in NED: the twist is in body axes unless the channel says otherwise."""
+    if series.metadata.get("twist_frame") == "ned":
+        velocity: NDArray[np.float64] = series.data["twist_twist_linear"]
+        return velocity
+    from logs.estimates import odometry_columns
+
+    return odometry_columns(series).velocity_mps
 
 
 def _on_inertial_clock(series: Series, offsets: dict[str, int]) -> Times:

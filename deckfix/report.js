@@ -8,8 +8,7 @@
       figure.layout.margin.l = 50;
       figure.layout.margin.r = 6;
     }
-    const settings = { responsive: true, displaylogo: false, displayModeBar: narrow() ? false : "hover",
-      modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+    const settings = { responsive: true, displaylogo: false, displayModeBar: false, doubleClick: "reset" };
     return Plotly.newPlot(place, figure.data, figure.layout, settings);
   }
   const places = Array.from(document.querySelectorAll(".plot"));

@@ -1,7 +1,8 @@
 """The report: one self-contained HTML page, without network, that opens on any machine and any phone.
 
-All text from a log is escaped: in the page as HTML, in the figures' data by writing ``<``, ``>`` and ``&`` as JSON
-escapes, and a content security policy lets only the page's own two scripts run and nothing be fetched.
+All text from a log is escaped: in the page as HTML, in the figures' data by writing ``<``, ``>`` and ``&``
+as JSON escapes, and a content security policy lets only the page's own two scripts run and nothing be
+fetched.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from estimation.outcome import Outcome
 MOST_SENSORS = 12
 """So many sensors get plots of their innovations; the tables name all."""
 
+_RATIO_WORDS = {"roll_pitch": "roll and pitch"}
 _WORDS = {Severity.SERIOUS: "serious", Severity.WARNING: "warning", Severity.NOTE: "note"}
 
 
@@ -135,17 +137,16 @@ def _header(result: Result, found: list[Finding]) -> str:
     if not len(result.run.t_ns):
         worst = Severity.SERIOUS
     cells = [("duration", _duration(result.duration_s)), ("estimates", f"{len(result.run.t_ns):,}")]
-    records = result.run.records
-    if len(records):
-        share = np.mean(records["outcome"] <= int(Outcome.DOWNWEIGHTED))
-        cells.append(("measurements fused", f"{100 * share:.1f} % <small>of {len(records):,}</small>"))
+    if len(result.tried):
+        share = float(np.mean(result.tried["outcome"] <= int(Outcome.DOWNWEIGHTED)))
+        cells.append(("measurements fused", f"{100 * share:.1f} % <small>of {len(result.tried):,}</small>"))
     cells += _accuracy(result)
-    engine = text(result.run.engine)
-    speed = result.duration_s / result.wall_s if result.wall_s > 0 else 0.0
-    cells.append(("engine", f"{engine} <small>{speed:.0f}x real time</small>" if speed >= 1 else engine))
     facts = "".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in cells)
+    speed = result.duration_s / result.wall_s if result.wall_s > 0 else 0.0
+    engine = f"{text(result.run.engine)} engine" + (f", {speed:.0f} times real time" if speed >= 2 else "")
     return (
-        f'<header><p class="eyebrow">Flight report</p><h1>{text(result.flight)}</h1>'
+        f'<header><p class="eyebrow">Flight report · {engine} · deckfix {__version__}</p>'
+        f"<h1>{text(result.flight)}</h1>"
         f'<p class="verdict {_WORDS[worst]}">{text(verdict(result, found))}</p>'
         f'<dl class="figures">{facts}</dl></header>'
     )
@@ -184,8 +185,8 @@ def _duration(seconds: float) -> str:
 def _wrong(found: list[Finding]) -> str:
     if not found:
         return (
-            '<p class="clear">Nothing was found. No measurement was rejected to a noticeable degree, no gap, no '
-            "inconsistent innovation, no implausible bias.</p>"
+            '<p class="clear">Nothing was found. No measurement was rejected to a noticeable degree, no gap, '
+            "no inconsistent innovation, no implausible bias.</p>"
         )
     heads = ("", "symptom", "likely cause", "what to do")
     rows = [
@@ -199,9 +200,11 @@ def _track(result: Result, plots: _Plots) -> str:
     if not len(result.run.t_ns):
         return ""
     about = "Positions are relative to the origin below; references are shifted by their constant offset."
-    lat, lon, alt = (float(v) for v in result.run.origin)
+    if result.run.origin is not None:
+        lat, lon, alt = result.run.origin
+        about += f" Origin: {np.rad2deg(lat):.6f}°, {np.rad2deg(lon):.6f}°, {alt:.1f} m."
     return (
-        f'<p class="lead">{about} Origin: {np.rad2deg(lat):.6f}°, {np.rad2deg(lon):.6f}°, {alt:.1f} m.</p>'
+        f'<p class="lead">{about}</p>'
         '<div class="pair">'
         f"<div>{plots.place(figures.track(result), 'Track on the level plane')}</div>"
         f"<div>{plots.place(figures.height(result), 'Height over time')}</div></div>"
@@ -213,8 +216,9 @@ def _estimate(result: Result, plots: _Plots) -> str:
         return ""
     if result.truth_errors is not None:
         about = (
-            "Errors against the truth in the log. An honest filter stays inside its ±3 sigma band nearly always, and "
-            "is not far inside it. The position is less its constant offset."
+            "Errors against the truth in the log. An honest filter stays inside its ±3 sigma band nearly "
+            "always, and is not far inside it. The position is less its constant offset. Where the plot is "
+            "wholly shaded, the band reaches beyond it."
         )
     else:
         about = "The log holds no truth, so the estimates themselves are shown, with their ±3 sigma band."
@@ -273,11 +277,11 @@ def _measurements(result: Result, plots: _Plots) -> str:
         assert s is not None
         doubtful = s.count >= 30 and not 0.2 <= s.mean_over_dof <= 2.0
         mean = f'<span class="off">{s.mean_over_dof:.2f}</span>' if doubtful else f"{s.mean_over_dof:.2f}"
-        rows.append(("", [text(name), f"{s.count:,}", mean, f"{100 * s.inside_95:.0f} %"]))
+        rows.append(("", [_name(name), f"{s.count:,}", mean, f"{100 * s.inside_95:.0f} %"]))
     out = [
-        '<p class="lead">An innovation is a measurement less its prediction. Its normalised square, the NIS, averages '
-        "to one per degree of freedom when noise and latency are right, and lies in the green band 95 % of the "
-        "time.</p>",
+        '<p class="lead">An innovation is a measurement less its prediction. Its normalised square, the NIS, '
+        "averages to one per degree of freedom when noise and latency are right, and lies in the green band "
+        "95 % of the time.</p>",
         _table(("sensor", "innovations", "NIS / dof", "inside 95 % band"), rows, numeric=(1, 2, 3)),
     ]
     for name in shown[:MOST_SENSORS]:
@@ -294,12 +298,19 @@ def _outcomes(result: Result, plots: _Plots) -> str:
     counts = {name: result.outcomes(name) for name in result.measured}
     used = [o for o in Outcome if any(o in c for c in counts.values())]
     heads = ("sensor", *(o.name.lower().replace("_", " ") for o in used))
-    rows = [("", [text(n), *(f"{c[o]:,}" if o in c else "" for o in used)]) for n, c in counts.items()]
-    return (
-        '<p class="lead">Every measurement ends in exactly one outcome.</p>'
-        + plots.place(figures.outcomes(result), "Outcomes over time")
-        + _table(heads, rows, numeric=tuple(range(1, len(heads))))
-    )
+    rows = [("", [_name(n), *(f"{c[o]:,}" if o in c else "" for o in used)]) for n, c in counts.items()]
+    out = ['<p class="lead">Every measurement ends in exactly one outcome.']
+    if result.unused:
+        names = ", ".join(text(n) for n in result.unused)
+        out.append(f" Never tried, because switched off in the configuration or not ready: {names}.")
+    out += ["</p>", plots.place(figures.outcomes(result), "Outcomes over time") if len(result.tried) else ""]
+    out.append(_table(heads, rows, numeric=tuple(range(1, len(heads)))))
+    if result.run.notes:
+        lines = [
+            f"<li>{result.seconds(int(t)):.1f} s: {text(note)}</li>" for t, note in result.run.notes[:200]
+        ]
+        out.append(f'<h3>Notes of the filter</h3><ul class="plain">{"".join(lines)}</ul>')
+    return "".join(out)
 
 
 def _states(result: Result, plots: _Plots) -> str:
@@ -326,7 +337,7 @@ def _inputs(result: Result, plots: _Plots) -> str:
     rows = []
     for s in result.streams:
         start = f"{s.longest_gap_s:.2f} s" if s.gaps else ""
-        cells = [text(s.name), s.kind.name.lower().replace("_", " "), f"{s.count:,}", f"{s.rate_hz:.1f} Hz"]
+        cells = [_name(s.name), s.kind.name.lower().replace("_", " "), f"{s.count:,}", f"{s.rate_hz:.1f} Hz"]
         rows.append(("", [*cells, str(len(s.gaps)), start]))
     heads = ("sensor", "kind", "messages", "rate", "gaps", "longest gap")
     about = "A gap is an interval of more than five times the usual one."
@@ -346,6 +357,11 @@ def _inputs(result: Result, plots: _Plots) -> str:
     )
 
 
+def _name(sensor: str) -> str:
+    """Return a sensor's name that may break at its underscores."""
+    return text(sensor).replace("_", "_<wbr>")
+
+
 def _number(value: object) -> str:
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
@@ -359,9 +375,8 @@ def _configuration(result: Result) -> str:
         if not entries:
             continue
         lines = "\n".join(f"{key} = {_shorten(value)}" for key, value in sorted(entries.items()))
-        out.append(
-            f"<details><summary>From the log: {text(name)}</summary><pre>{text(lines[:60_000])}</pre></details>"
-        )
+        out.append(f"<details><summary>From the log: {text(name)}</summary>")
+        out.append(f"<pre>{text(lines[:60_000])}</pre></details>")
     if result.messages:
         said = "\n".join(
             f"{result.seconds(m.t_ns):9.2f} s  {m.source}: {_shorten(m.text)}" for m in result.messages[:2000]
@@ -393,4 +408,5 @@ def _table(
         f'<tr class="{kind}">{"".join(cell("td", i, c) for i, c in enumerate(cells))}</tr>'
         for kind, cells in rows
     )
-    return f'<div class="scroll"><table class="{css}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    table = f'<table class="{css}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
+    return f'<div class="scroll">{table}</div>'

@@ -1,4 +1,4 @@
-"""The result of a replay: estimates, what became of each measurement, and how both compare with references."""
+"""The result of a replay: estimates, the fate of each measurement, and comparisons with references."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class LogMessage:
 
 @dataclass(frozen=True, slots=True)
 class NisStatistics:
-    """Of one sensor's ``count`` normalised innovations squared: mean over their degrees of freedom (1 when the
-    filter is honest), and the share inside their two-sided 95 % band (0.95 when it is).
+    """Of one sensor's ``count`` normalised innovations squared: mean over their degrees of freedom (1 when
+    the filter is honest), and the share inside their two-sided 95 % band (0.95 when it is).
     """
 
     count: int
@@ -49,7 +49,7 @@ class NisStatistics:
 
 @dataclass(slots=True)
 class AtReference:
-    """Both estimates less the truth at the times of the autopilot's own estimate, for the ratio of the two."""
+    """Both estimates less the truth, at the times of the autopilot's own estimate."""
 
     ours: Errors
     autopilot: Errors
@@ -59,9 +59,10 @@ class AtReference:
 class Result:
     """Everything that a replay gave.
 
-    ``run`` holds the estimates and the measurements' records; ``t_s`` are seconds from ``start_ns``, the first
-    inertial sample. ``truth_errors`` are at the estimates' times; ``at_autopilot`` at the autopilot's; both are
-    None where the log holds no such reference. ``source`` is the log it came from, for ``write``.
+    ``run`` holds the estimates and the measurements' records; ``t_s`` are seconds from ``start_ns``, the
+    first inertial sample. ``truth_errors`` are at the estimates' times; ``at_autopilot`` at the
+    autopilot's; both are None where the log holds no such reference. ``source`` is the log it came from,
+    for ``write``.
     """
 
     flight: str
@@ -87,7 +88,7 @@ class Result:
     @cached_property
     def t_s(self) -> Array:
         """Times of the estimates [s] from the first inertial sample, shape (n,)."""
-        return (self.run.t_ns - self.start_ns) * 1e-9
+        return self.seconds_of(self.run.t_ns)
 
     @cached_property
     def euler_rad(self) -> Array:
@@ -106,19 +107,43 @@ class Result:
         """Time from the first to the last inertial sample [s]."""
         return (self.end_ns - self.start_ns) * 1e-9
 
+    def seconds_of(self, t_ns: NDArray[np.int64]) -> Array:
+        """Return times on the inertial clock as seconds from the first inertial sample."""
+        return (t_ns - self.start_ns).astype(np.float64) * 1e-9
+
     def seconds(self, t_ns: int) -> float:
         """Return a time on the inertial clock as seconds from the first inertial sample."""
         return (t_ns - self.start_ns) * 1e-9
 
     def sensor_records(self, name: str) -> NDArray[np.void]:
         """Return the records of one sensor's measurements."""
-        return self.run.records[self.run.records["sensor"] == self.run.sensors.index(name)]
+        records: NDArray[np.void] = self.run.records
+        chosen: NDArray[np.void] = records[records["sensor"] == self.run.sensors.index(name)]
+        return chosen
 
     @cached_property
     def measured(self) -> tuple[str, ...]:
         """Names of the sensors that have records, in the estimator's order."""
         present = set(np.unique(self.run.records["sensor"]).tolist())
         return tuple(name for i, name in enumerate(self.run.sensors) if i in present)
+
+    @cached_property
+    def unused(self) -> tuple[str, ...]:
+        """Names of the sensors none of whose measurements was ever tried: switched off, or never ready."""
+        nothing = {Outcome.REJECTED_NOT_READY}
+        return tuple(n for n in self.measured if set(self.outcomes(n)) == nothing)
+
+    @cached_property
+    def tried(self) -> NDArray[np.void]:
+        """The records of the sensors that are in use, from the first estimate on."""
+        records = self.run.records
+        if not len(self.run.t_ns):
+            return records[:0]
+        off = [self.run.sensors.index(n) for n in self.unused]
+        tried: NDArray[np.void] = records[
+            ~np.isin(records["sensor"], off) & (records["t_ns"] >= self.run.t_ns[0])
+        ]
+        return tried
 
     def outcomes(self, name: str) -> dict[Outcome, int]:
         """Return how often each outcome befell a sensor's measurements; those that never did are left out."""
@@ -137,7 +162,9 @@ class Result:
         return NisStatistics(len(records), float(np.mean(records["nis"] / dof)), float(np.mean(inside)))
 
     def summary(self) -> dict[str, Any]:
-        """Return the summary that ``deckfix replay --json`` writes (docs/json.md); what is absent is left out."""
+        """Return the summary that ``deckfix replay --json`` writes (docs/json.md); what is absent is left
+        out.
+        """
         out: dict[str, Any] = {
             "flight": self.flight,
             "duration_s": self.duration_s,

@@ -17,11 +17,12 @@ GAP_FLOOR_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Events of one sensor: ``stamp_ns`` (n,) as its source gave them, ascending; gaps as (start, length) in s.
+    """Events of one sensor: ``stamp_ns`` (n,) as its source gave them, ascending; gaps as (start, length)
+    in s.
 
-    A gap is an interval of more than five times the median one, and of more than 20 ms; its start counts from
-    the first stamp. ``rate_hz`` is one over the median interval (0 where there are fewer than two events).
-    ``backwards`` counts stamps that were older than the one before them in the order of arrival.
+    A gap is an interval of more than five times the median one, and of more than 20 ms; its start counts
+    from the first stamp. ``rate_hz`` is one over the median interval (0 where there are fewer than two
+    events). ``backwards`` counts stamps that were older than the one before them in the order of arrival.
     """
 
     name: str
