@@ -46,6 +46,7 @@ from estimation.state import (
     Layout,
     nominal_zero,
 )
+from estimation.update import MEMORY_SIZE
 
 REST_GYRO_RADPS = 0.05
 """Largest standard deviation of the angular velocity at rest [rad/s]."""
@@ -57,6 +58,8 @@ LEVEL_TIME_S = 10.0
 """Time constant with which the running horizon follows the specific force."""
 HEADING_MEMORY_S = 60.0
 """Memory of the heading from accelerations."""
+TRY_NS = 100_000_000
+"""Spacing of the attempts to start."""
 FRESH_NS = 1_000_000_000
 """Oldest GPS, magnetometer or attitude that a start may use."""
 
@@ -92,7 +95,8 @@ class Aligner:
     _level: Array | None = None
     _impulse: Array = field(default_factory=lambda: np.zeros(3))
     _previous_velocity: tuple[int, Array] | None = None
-    _heading_sums: Array = field(default_factory=lambda: np.zeros(4))
+    _heading_sums: Array = field(default_factory=lambda: np.zeros(5))
+    _tried_ns: int | None = None
 
     def consume(self, rows: Rows, start: int, stop: int) -> tuple[int, Aligned] | None:
         """Take rows in order; return the index after the inertial sample at which the filter can start, and the state.
@@ -103,7 +107,10 @@ class Aligner:
             t, kind, value = int(rows.t_ns[i]), int(rows.kind[i]), rows.value[i].copy()
             if kind == Kind.IMU:
                 self._take_imu(t, value)
-                aligned = self._try(t)
+                due = self._tried_ns is None or t - self._tried_ns >= TRY_NS
+                aligned = self._try(t) if due else None
+                if due:
+                    self._tried_ns = t
                 if aligned is not None:
                     return i + 1, aligned
             elif kind == Kind.GPS_POSITION and self._good(value, rows.own[i]):
@@ -180,20 +187,21 @@ class Aligner:
                 forget = math.exp(-(t - t0) * 1e-9 / HEADING_MEMORY_S)
                 self._heading_sums *= forget
                 self._heading_sums += [
-                    u[0] * d[0] + u[1] * d[1], u[0] * d[1] - u[1] * d[0], float(u @ u), float(d @ d),
+                    u[0] * d[0] + u[1] * d[1], u[0] * d[1] - u[1] * d[0], float(u @ u), float(d @ d), 2.0,
                 ]  # fmt: skip
             self._previous_velocity = (t, velocity)
             self._impulse = np.zeros(3)
 
     def _heading_from_motion(self) -> tuple[float, float] | None:
         """Return the angle from the running horizon's heading to true north and its 1-sigma [rad]."""
-        cosine, sine, uu, dd = self._heading_sums
+        cosine, sine, uu, dd, count = self._heading_sums
         if uu < 0.5:
             return None
         angle = math.atan2(sine, cosine)
         residual = max(0.0, dd - math.hypot(sine, cosine) ** 2 / uu)
-        noise = max(2.0 * self.config.gps.velocity_sigma_mps**2, residual / 10.0)
-        return angle, math.sqrt(noise / uu)
+        # Neighbouring changes of velocity share a fix and a tilt error: count a fourth of them.
+        variance = max(0.01, 4.0 * residual / count)
+        return angle, math.sqrt(variance / uu)
 
     def _still(self, window: Array) -> bool:
         quiet = bool(
@@ -261,11 +269,11 @@ class Aligner:
             yaw = float(quat_to_euler(self._attitude[1])[2])
             return _attitude_from(force, up, yaw), sigma, f"{where}, heading from the autopilot's attitude"
         found = self._heading_from_motion()
-        if found is None or found[1] > sigma or self._level is None:
+        if found is None or found[1] > c.initialisation.motion_yaw_sigma_rad or self._level is None:
             return None
         turn = euler_to_quat(0.0, 0.0, found[0])
         q = quat_normalise(quat_multiply(turn, self._level))
-        return q, sigma, "in flight, heading from horizontal acceleration"
+        return q, max(sigma, 1.5 * found[1]), "in flight, heading from horizontal acceleration"
 
     def _acceleration(self) -> Array:
         """Return the mean NED acceleration over the window, from GPS velocities."""
@@ -328,9 +336,9 @@ class Aligner:
                 P[k, k] = P[d, d] + c.barometer.sigma_m**2
             else:
                 P[k, k] = 100.0**2
-        lock = np.zeros((self.sensors, 6))
+        memory = np.zeros((self.sensors, MEMORY_SIZE))
         clock = np.array([t, t, t], dtype=np.int64)
-        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(2), lock)
+        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(2), memory)
 
 
 def _attitude_from(force: Array, up: Array, yaw: float) -> Array:

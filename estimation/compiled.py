@@ -23,7 +23,7 @@ from numba.extending import overload, register_jitable
 from estimation import frames, models, parameters, state, update
 from estimation import rows as rows_module
 from estimation.frames import Array
-from estimation.models import measure, right_jacobian, transition
+from estimation.models import BAROMETER, measure, right_jacobian, transition
 from estimation.outcome import Outcome
 from estimation.rows import (
     KIND,
@@ -41,7 +41,7 @@ from estimation.rows import (
     Rows,
 )
 from estimation.state import ATTITUDE, Layout, Offsets, plus
-from estimation.update import MAX_STEP_S, extra_noise, interpolate, locked_out, reset_datum, scatter_update, weight
+from estimation.update import MAX_STEP_S, extra_noise, interpolate, locked_out, reading_noise, reset_datum, scatter_update, weight
 
 _FUSED = int(Outcome.FUSED)
 _FUSED_LATE = int(Outcome.FUSED_LATE)
@@ -160,7 +160,7 @@ def _propagate(
 
 
 def _fuse(
-    x: Array, P: Array, lock: Array, kind: int, value: Array, own: Array, gyro: Array, t_s: float, late: int,
+    x: Array, P: Array, memory: Array, kind: int, value: Array, own: Array, gyro: Array, t_s: float, late: int,
     p: Array, offsets: Offsets, H3: Array, result: Array,
 ) -> tuple[int, int, Array]:  # fmt: skip
     n = P.shape[0]
@@ -171,6 +171,8 @@ def _fuse(
     if m < 0:
         return -m, 0, x
     r, H, R = r3[:m], np.ascontiguousarray(H3[:m]), R3[:m, :m].copy()
+    if kind == BAROMETER:
+        R[0, 0] = reading_noise(memory, t_s, r[0], R[0, 0])
     PHt = P @ H.T
     S = H @ PHt + R
     nis = r @ np.linalg.solve(S, r)
@@ -182,12 +184,12 @@ def _fuse(
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     if w == 0.0:
-        if locked_out(lock, kind, t_s, r, m, p):
+        if locked_out(memory, kind, t_s, r, m, p):
             reset_datum(kind, x, P, r, R, m, offsets)
-            lock[0] = 0.0
+            memory[0] = 0.0
             return outcome, 1, x
         return _REJECTED_GATE, 0, x
-    lock[0] = 0.0
+    memory[0] = 0.0
     if w < 1.0:
         outcome = _DOWNWEIGHTED
         R = R / w
@@ -214,7 +216,7 @@ register_jitable(_fuse)
 
 
 def _advance(
-    clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, lock: Array, p: Array, offsets: Offsets,
+    clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, p: Array, offsets: Offsets,
     ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array, out_sigma: Array,
     out_covariance: Array, count: int, emit_after_ns: int, period_ns: int,
 ) -> int:  # fmt: skip
@@ -236,7 +238,7 @@ def _advance(
             gyro = interpolate(imu0, clock[1], imu, t_imu, t)[:3]
             t_s = (t - clock[2]) * 1e-9
             ints[i, OUTCOME], ints[i, RESET], state = _fuse(
-                state, P, lock[ints[i, SENSOR]], ints[i, KIND], floats[i, VALUE:OWN], floats[i, OWN:RESULT], gyro, t_s,
+                state, P, memory[ints[i, SENSOR]], ints[i, KIND], floats[i, VALUE:OWN], floats[i, OWN:RESULT], gyro, t_s,
                 ints[i, LATE], p, offsets, H, floats[i, RESULT:],
             )  # fmt: skip
             continue
@@ -290,7 +292,7 @@ class CompiledEngine:
         """Process the rows start..stop in order; see ``FilterPyEngine.advance``."""
         s = self.state
         out.count = _kernel(
-            s.clock, s.x, s.P, s.imu, s.scatter, s.lock, self.p, self.layout.offsets,
+            s.clock, s.x, s.P, s.imu, s.scatter, s.memory, self.p, self.layout.offsets,
             rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.count, emit_after_ns,
             period_ns,
         )  # fmt: skip

@@ -83,17 +83,17 @@ class ImuConfig(_Table):
         float,
         _not_negative(
             "share of the measured sample-to-sample scatter that is added to the white noise (0: off). A vibrating "
-            "airframe aliases into the specific force; 1 takes the scatter as white",
+            "airframe aliases into the specific force; 1 would take all of it as white",
             "-",
         ),
-    ] = 1.0
+    ] = 0.02
     latency_s: Annotated[
         float | None,
         _number("age of a sample at its stamp (filter delay); None: as the log says, else 0", "s"),
     ] = None
     gap_s: Annotated[
         float, _positive("longest gap that is bridged; a longer one starts a new alignment", "s")
-    ] = 0.5
+    ] = 3.0
 
 
 class GpsConfig(_Table):
@@ -225,8 +225,12 @@ class InitialisationConfig(_Table):
     tilt_sigma_rad: Annotated[float, _positive("1-sigma of roll and pitch levelled at rest", "rad")] = 0.01
     flight_tilt_sigma_rad: Annotated[float, _positive("1-sigma of roll and pitch levelled in flight", "rad")] = 0.05
     yaw_sigma_rad: Annotated[
-        float, _positive("1-sigma of the first yaw; also how well it must be known before the start", "rad")
+        float, _positive("1-sigma of the first yaw from a magnetometer or another estimator", "rad")
     ] = 0.09
+    motion_yaw_sigma_rad: Annotated[
+        float,
+        _positive("how well a yaw from accelerations, where there is no magnetometer, must be known", "rad"),
+    ] = 0.2
 
 
 class Config(_Table):

@@ -124,6 +124,10 @@ class FilterPyEngine:
             rows.outcome[i] = -m
             return
         r, H, R = r[:m], H[:m], R[:m, :m]
+        memory = s.memory[rows.sensor[i]]
+        t_s = (int(rows.t_ns[i]) - int(s.clock[2])) * 1e-9
+        if kind == models.BAROMETER:
+            R[0, 0] = update.reading_noise(memory, t_s, r[0], R[0, 0])
         S = H @ s.P @ H.T + R
         nis = float(r @ np.linalg.solve(S, r))
         rows.result[i, 0] = nis
@@ -131,17 +135,15 @@ class FilterPyEngine:
         rows.result[i, 2 : 2 + m] = r
         rows.result[i, 5 : 5 + m] = np.sqrt(np.diag(S))
         w = update.weight(nis, m, self.p)
-        lock = s.lock[rows.sensor[i]]
         if w == 0.0:
-            t_s = (int(rows.t_ns[i]) - int(s.clock[2])) * 1e-9
             rows.outcome[i] = Outcome.REJECTED_GATE
-            if update.locked_out(lock, kind, t_s, r, m, self.p):
+            if update.locked_out(memory, kind, t_s, r, m, self.p):
                 update.reset_datum(kind, s.x, s.P, r, R, m, self.layout.offsets)
-                lock[0] = 0.0
+                memory[0] = 0.0
                 rows.reset[i] = 1
                 rows.outcome[i] = Outcome.FUSED_LATE if rows.late[i] else Outcome.FUSED
             return
-        lock[0] = 0.0
+        memory[0] = 0.0
         rows.outcome[i] = Outcome.FUSED_LATE if rows.late[i] else Outcome.FUSED
         if w < 1.0:
             rows.outcome[i] = Outcome.DOWNWEIGHTED

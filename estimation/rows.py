@@ -168,7 +168,7 @@ class FilterState:
     """Everything that the next step depends on; copied, it is a checkpoint.
 
     ``clock`` holds the state's time, the last inertial sample's and the start's [ns]; ``imu`` that sample;
-    ``scatter`` the vibration measure; ``lock`` the lock-out memory of each sensor.
+    ``scatter`` the vibration measure; ``memory`` what is remembered of each sensor.
     """
 
     clock: Int
@@ -176,10 +176,10 @@ class FilterState:
     P: Array
     imu: Array
     scatter: Array
-    lock: Array
+    memory: Array
 
     def copy(self) -> FilterState:
         """Return an independent copy."""
         return FilterState(
-            self.clock.copy(), self.x.copy(), self.P.copy(), self.imu.copy(), self.scatter.copy(), self.lock.copy()
+            self.clock.copy(), self.x.copy(), self.P.copy(), self.imu.copy(), self.scatter.copy(), self.memory.copy()
         )

@@ -18,17 +18,20 @@ MAX_STEP_S = 0.025
 """Longest step of the strapdown integration [s]; longer intervals are cut."""
 LONG_STEP_S = 0.05
 """An interval between inertial samples beyond this [s] is a gap: its unknown motion is added as noise."""
-GAP_ACCEL = 2.0
-"""Unknown specific force in a gap [m/s^2], 1-sigma."""
-GAP_RATE = 0.5
-"""Unknown angular velocity in a gap [rad/s], 1-sigma."""
+GAP_ACCEL = 1.5
+"""Unknown specific force in a gap, taken as constant over it [m/s^2], 1-sigma."""
+GAP_ATTITUDE = 0.15
+"""Unknown rotation in a gap [rad/rts], 1-sigma: a hovering multirotor stays near level and holds its heading."""
 SCATTER_TIME_S = 1.0
 """Averaging time of the vibration measure [s]."""
 RESET_COUNT = 5
 """Rejected measurements that must agree before a reset."""
 
-LOCK_SIZE = 6
-"""Entries per sensor of the lock-out memory: count, first and last time [s], last innovation (3)."""
+MEMORY_SIZE = 9
+"""Entries per sensor of what is remembered of it: rejected in a row, first and last time of these [s], last rejected
+innovation (3); time [s] and innovation of the last reading, variance of its white noise (``reading_noise``)."""
+NOISE_TIME_S = 5.0
+"""Averaging time of a sensor's own white noise."""
 
 
 def interpolate(imu0: Array, t0: int, imu1: Array, t1: int, t: float) -> Array:
@@ -64,8 +67,27 @@ def extra_noise(scatter: Array, dt_imu: float, p: Array) -> Array:
     extra[1] = p[par.VIBRATION_GAIN] * scatter[1] * dt_imu
     if dt_imu > LONG_STEP_S:
         extra[0] += GAP_ACCEL**2 * dt_imu
-        extra[1] += GAP_RATE**2 * dt_imu
+        extra[1] += GAP_ATTITUDE**2
     return extra
+
+
+def reading_noise(memory: Array, t_s: float, innovation: float, variance: float) -> float:
+    """Return the white variance of a scalar sensor: the configured one, or what its readings show where that is more.
+
+    Half the mean squared difference of neighbouring innovations, each held to three sigma so that a jump does not
+    count as noise; remembered in the sensor's own ``memory``. A barometer in propeller wash is several times noisier
+    than on the bench.
+    """
+    shown = max(memory[8], variance)
+    dt = t_s - memory[6]
+    if memory[8] > 0.0 and 0.0 < dt < 1.0:
+        difference = 0.5 * (innovation - memory[7]) ** 2
+        memory[8] += (1.0 - math.exp(-dt / NOISE_TIME_S)) * (min(difference, 9.0 * shown) - memory[8])
+    elif memory[8] == 0.0:
+        memory[8] = variance
+    memory[6] = t_s
+    memory[7] = innovation
+    return max(memory[8], variance)
 
 
 def weight(nis: float, dimension: int, p: Array) -> float:
@@ -79,10 +101,10 @@ def weight(nis: float, dimension: int, p: Array) -> float:
     return 1.0 if nis <= bound else math.sqrt(bound / nis)
 
 
-def locked_out(lock: Array, kind: int, t_s: float, r: Array, dimension: int, p: Array) -> bool:
+def locked_out(memory: Array, kind: int, t_s: float, r: Array, dimension: int, p: Array) -> bool:
     """Note a rejection; return True when the sensor has contradicted the filter, but not itself, for too long.
 
-    ``lock`` is the sensor's own memory. Only sensors that carry a datum (GPS, barometer) can ever be right against
+    ``memory`` is the sensor's own. Only sensors that carry a datum (GPS, barometer) can ever be right against
     the filter; no number of rejections lets any other sensor in.
     """
     if kind == GPS_POSITION:
@@ -93,15 +115,15 @@ def locked_out(lock: Array, kind: int, t_s: float, r: Array, dimension: int, p: 
         return False
     change = 0.0
     for i in range(dimension):
-        change += (r[i] - lock[3 + i]) ** 2
-    if lock[0] == 0.0 or math.sqrt(change) > tolerance + 2.0 * (t_s - lock[2]):
-        lock[0] = 0.0
-        lock[1] = t_s
-    lock[0] += 1.0
-    lock[2] = t_s
+        change += (r[i] - memory[3 + i]) ** 2
+    if memory[0] == 0.0 or math.sqrt(change) > tolerance + 2.0 * (t_s - memory[2]):
+        memory[0] = 0.0
+        memory[1] = t_s
+    memory[0] += 1.0
+    memory[2] = t_s
     for i in range(dimension):
-        lock[3 + i] = r[i]
-    return lock[0] >= RESET_COUNT and t_s - lock[1] >= p[par.GPS_RESET_AFTER]
+        memory[3 + i] = r[i]
+    return memory[0] >= RESET_COUNT and t_s - memory[1] >= p[par.GPS_RESET_AFTER]
 
 
 def reset_datum(kind: int, x: Array, P: Array, r: Array, R: Array, dimension: int, offsets: Offsets) -> None:
