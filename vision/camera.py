@@ -372,9 +372,7 @@ def _undistort(xd: Array, yd: Array, distortion: tuple[float, ...]) -> tuple[Arr
                 break
         ex, ey = _distort(x, y, distortion)
         bad = ~(np.abs(ex - xd) + np.abs(ey - yd) < 1e-9)
-    x[bad] = np.nan
-    y[bad] = np.nan
-    return x, y
+    return np.where(bad, np.nan, x), np.where(bad, np.nan, y)
 
 
 def _raspberry_pi_v2(width: int, height: int, columns: int, rows_read: int) -> Camera:

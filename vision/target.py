@@ -83,6 +83,8 @@ class RingTarget:
             if len(colour) != 3 or not all(0 <= c <= 255 for c in colour):
                 raise ValueError(f"{field}: {colour} is not three values from 0 to 255")
             object.__setattr__(self, field, colour)
+        if not isinstance(self.name, str) or not self.name.isprintable():
+            raise ValueError(f"name: {self.name!r} is not a line of printable text")
         red, green, blue = self.red_rgb
         if red <= 1.3 * max(green, blue):
             raise ValueError(f"red_rgb: {self.red_rgb} is not red: R must exceed 1.3 times G and B")
