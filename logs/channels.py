@@ -45,7 +45,7 @@ class LoggedMessage:
     publish_time_ns: int
     sequence: int
     data: bytes
-    decoder: Callable[[bytes], Any] | None
+    find_decoder: Callable[[], Callable[[bytes], Any] | None]
 
     @property
     def topic(self) -> str:
@@ -59,12 +59,13 @@ class LoggedMessage:
         Raises:
             LogError: the message is not ROS 2 CDR, or is damaged.
         """
-        if self.decoder is None:
+        decoder = self.find_decoder()
+        if decoder is None:
             raise LogError(
                 self.topic, f"encoded as {self.channel.message_encoding!r}", "read its data as bytes"
             )
         try:
-            return self.decoder(self.data)
+            return decoder(self.data)
         except Exception as error:  # the generic decoder raises whatever its input provokes
             raise LogError(self.topic, f"a message is damaged ({error})", "recover the file") from error
 

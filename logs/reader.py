@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -156,7 +157,7 @@ class Flight:
                 continue
             data = bytes(records[offset + _MESSAGE.size : offset + 9 + length])
             yield LoggedMessage(
-                infos[channel], log_time, publish_time, sequence, data, self._decoder(channel)
+                infos[channel], log_time, publish_time, sequence, data, partial(self._decoder, channel)
             )
 
     def verify(self) -> bool:
@@ -249,10 +250,12 @@ class Flight:
 
             channel = self._contents.channels[number]
             schema = self._contents.schemas.get(channel.schema_id)
-            try:
-                made = DecoderFactory().decoder_for(channel.message_encoding, schema)
-            except Exception:  # the parser of definitions raises its own errors and those of its helpers
-                made = None
+            made = None
+            if schema is not None and self._definition(self._channel_infos()[number]) is not None:
+                try:
+                    made = DecoderFactory().decoder_for(channel.message_encoding, schema)
+                except Exception:  # its parser raises its own errors and those of its helpers
+                    self._contents.report(f"{channel.topic} has a definition that cannot be decoded.")
             self._decoders[number] = made
         return self._decoders[number]
 

@@ -111,33 +111,48 @@ def scan(path: Path, data: FileBytes) -> Contents:
         if MAGIC.startswith(bytes(data.view[:8])):
             raise LogError(path, "the file ends within its first bytes", "nothing can be recovered from it")
         raise LogError(path, "not an MCAP file", "import other logs with 'deckfix import'")
-    summary = _from_summary(data)
-    return summary if summary is not None else _Linear(data).run()
+    problems: list[str] = []
+    summary = _from_summary(data, problems)
+    if summary is not None:
+        return summary
+    found = _Linear(data).run()
+    for problem in problems:
+        found.report(problem)
+        found.complete = False
+    return found
 
 
 def _parse(read: Callable[[ReadDataStream], R], content: memoryview) -> R:
     return read(ReadDataStream(BytesIO(content)))
 
 
-def _from_summary(data: FileBytes) -> Contents | None:
-    """Read the summary, or return None where it is missing, damaged or does not tell everything."""
+def _from_summary(data: FileBytes, problems: list[str]) -> Contents | None:
+    """Read the summary, or return None where it is missing, does not tell everything, or is damaged (a
+    problem).
+    """
+    damaged = "The end of the file is damaged; it was read record by record."
     if data.size < 8 + _FOOTER_BYTES or bytes(data.view[-8:]) != MAGIC:
-        return None
+        return None  # said by whoever reads on
     footer_at = data.size - _FOOTER_BYTES
     opcode, length = struct.unpack_from("<BQ", data.view, footer_at)
     if opcode != 2 or length != 20:
+        problems.append(damaged)
         return None
     footer = _parse(Footer.read, data.view[footer_at + 9 : footer_at + 29])
     start = footer.summary_start
-    if start == 0 or start > footer_at:
+    if start == 0:
+        return None
+    if start > footer_at:
+        problems.append(damaged)
         return None
     if footer.summary_crc and zlib.crc32(data.view[start : footer_at + 25]) != footer.summary_crc:
+        problems.append(damaged)
         return None
     try:
-        found = _read_summary(data, start, footer_at)
+        return _read_summary(data, start, footer_at)
     except PARSE_ERRORS:
+        problems.append(damaged)
         return None
-    return found
 
 
 def _read_summary(data: FileBytes, start: int, end: int) -> Contents | None:
@@ -268,6 +283,12 @@ class _Linear:
         if not self.ended:
             found.complete = False
             found.report("The file has no end: its recording was interrupted, or it was cut off.")
+        elif bytes(self.data.view[-8:]) != MAGIC:
+            found.complete = False
+            found.report("The end of the file is damaged or cut off.")
+        if not found.complete:
+            # Some index of a damaged file may be missing; the chunks themselves have check sums.
+            found.chunks = [replace(chunk, indexes=None) for chunk in found.chunks]
         found.loose = {c: np.array(e, dtype=INDEX_ENTRY) for c, e in self.loose.items()}
         self.complete_from_chunks()
         return found
@@ -316,7 +337,13 @@ class _Linear:
         elif opcode == 1:
             header = _parse(Header.read, content)
             found.profile, found.library = header.profile, header.library
-        elif opcode in (2, 15):
+        elif opcode == 15:
+            self.ended = True
+            (crc,) = struct.unpack_from("<I", content)
+            if crc and zlib.crc32(self.data.view[:position]) != crc:
+                found.report("The file fails its check sum: some of its bytes have changed.")
+                found.complete = False
+        elif opcode == 2:
             self.ended = True
 
     def close_chunk(self) -> None:
