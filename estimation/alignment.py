@@ -58,9 +58,11 @@ LEVEL_TIME_S = 10.0
 """Time constant with which the running horizon follows the specific force."""
 HEADING_MEMORY_S = 60.0
 """Memory of the heading from accelerations."""
+DIFFERENCE_NS = 1_000_000_000
+"""Spacing of the fixes whose difference stands for a velocity that the receiver does not give."""
 TRY_NS = 100_000_000
 """Spacing of the attempts to start."""
-FRESH_NS = 1_000_000_000
+FRESH_NS = 1_200_000_000
 """Oldest GPS, magnetometer or attitude that a start may use."""
 
 
@@ -89,6 +91,7 @@ class Aligner:
     _imu: list[tuple[int, Array]] = field(default_factory=list)
     _velocities: list[tuple[int, Array, Array]] = field(default_factory=list)
     _fix: tuple[int, Array, Array] | None = None
+    _earlier_fix: tuple[int, Array, Array] | None = None
     _mag: tuple[int, Array] | None = None
     _attitude: tuple[int, Array] | None = None
     _pressure: tuple[int, float] | None = None
@@ -114,7 +117,7 @@ class Aligner:
                 if aligned is not None:
                     return i + 1, aligned
             elif kind == Kind.GPS_POSITION and self._good(value, rows.own[i]):
-                self._fix = (t, value[:3], rows.own[i].copy())
+                self._take_fix(t, value[:3], rows.own[i].copy())
             elif kind == Kind.GPS_VELOCITY and value[3] >= 1.0:
                 self._take_velocity(t, value[:3], rows.own[i].copy())
             elif kind == Kind.MAGNETOMETER and self.config.magnetometer.use:
@@ -125,13 +128,25 @@ class Aligner:
                 self._pressure = (t, float(value[0]))
         return None
 
+    def _take_fix(self, t: int, fix: Array, own: Array) -> None:
+        """Keep a fix; where the receiver gives no velocity for a while, fixes make one."""
+        if self._earlier_fix is None:
+            self._earlier_fix = (t, fix, own)
+        t0, earlier, _ = self._earlier_fix
+        if t - t0 >= DIFFERENCE_NS:
+            if not self._velocities or t - self._velocities[-1][0] > DIFFERENCE_NS:
+                moved = geodetic_to_ned(fix[0], fix[1], fix[2], earlier)
+                self._take_velocity(t, moved / ((t - t0) * 1e-9), np.full(6, np.nan))
+            self._earlier_fix = (t, fix, own)
+        self._fix = (t, fix, own)
+
     @property
     def missing(self) -> str:
         """What the start still waits for, in words."""
         if len(self._imu) < 2:
             return "inertial samples"
         if self._fix is None or not self._velocities:
-            return "a good GPS position and velocity"
+            return "good GPS positions"
         if self._mag is None and self._attitude is None:
             return "a heading (magnetometer, autopilot attitude, or horizontal acceleration seen by GPS)"
         return "recent readings of all sensors"
@@ -172,9 +187,15 @@ class Aligner:
         f = 0.5 * (previous[3:] + value[3:])
         force_n = quat_to_matrix(self._level) @ f
         # A slow pull of the horizon towards the mean specific force.
-        pull = np.cross(force_n, [0.0, 0.0, -1.0]) / max(1.0, float(np.linalg.norm(force_n))) * (dt / LEVEL_TIME_S)
-        self._level = quat_normalise(quat_multiply(quat_exp(pull), quat_multiply(self._level, quat_exp(w * dt))))
-        self._impulse = self._impulse + (force_n + [0.0, 0.0, 9.81]) * dt
+        pull = (
+            np.cross(force_n, [0.0, 0.0, -1.0])
+            / max(1.0, float(np.linalg.norm(force_n)))
+            * (dt / LEVEL_TIME_S)
+        )
+        self._level = quat_normalise(
+            quat_multiply(quat_exp(pull), quat_multiply(self._level, quat_exp(w * dt)))
+        )
+        self._impulse = self._impulse + (force_n + np.array([0.0, 0.0, 9.81])) * dt
 
     def _take_velocity(self, t: int, velocity: Array, own: Array) -> None:
         self._velocities.append((t, velocity, own))
@@ -238,7 +259,11 @@ class Aligner:
         o = self.config.origin
         latitude, longitude, altitude = (float(v) for v in self._fix[1])
         if o.latitude_deg is not None and o.longitude_deg is not None and o.altitude_m is not None:
-            latitude, longitude, altitude = math.radians(o.latitude_deg), math.radians(o.longitude_deg), o.altitude_m
+            latitude, longitude, altitude = (
+                math.radians(o.latitude_deg),
+                math.radians(o.longitude_deg),
+                o.altitude_m,
+            )
         declination = self.declination_rad
         if declination is None:
             declination = world_magnetic_declination(latitude, longitude, altitude, self.utc_s)
@@ -285,14 +310,18 @@ class Aligner:
         a = (v1 - v0) / ((t1 - t0) * 1e-9)
         return np.where(np.isfinite(a), a, 0.0)
 
-    def _state(self, t: int, q: Array, yaw_sigma: float, rest: bool, velocity: Array, site: Site) -> FilterState:
+    def _state(
+        self, t: int, q: Array, yaw_sigma: float, rest: bool, velocity: Array, site: Site
+    ) -> FilterState:
         assert self._fix is not None
         c, o = self.config, self.layout.offsets
         window = self._window()
         x = nominal_zero()
         fix_t, fix, own = self._fix
         up_to_date = np.where(np.isfinite(velocity), velocity, 0.0)
-        x[P0 : P0 + 3] = geodetic_to_ned(*fix, np.array(site.origin)) + up_to_date * ((t - fix_t) * 1e-9)
+        x[P0 : P0 + 3] = geodetic_to_ned(fix[0], fix[1], fix[2], np.array(site.origin)) + up_to_date * (
+            (t - fix_t) * 1e-9
+        )
         x[V0 : V0 + 3] = 0.0 if rest else up_to_date
         x[Q0 : Q0 + 4] = q
         bias_known = rest or self.gyro_bias is not None
@@ -359,7 +388,9 @@ def _attitude_from(force: Array, up: Array, yaw: float) -> Array:
     return euler_to_quat(roll, pitch, yaw)
 
 
-def world_magnetic_declination(latitude_rad: float, longitude_rad: float, altitude_m: float, utc_s: float) -> float:
+def world_magnetic_declination(
+    latitude_rad: float, longitude_rad: float, altitude_m: float, utc_s: float
+) -> float:
     """Return the declination [rad, east positive] of the World Magnetic Model at a place and date.
 
     Dates outside the model's five years are taken at its nearer end.

@@ -41,7 +41,16 @@ from estimation.rows import (
     Rows,
 )
 from estimation.state import ATTITUDE, Layout, Offsets, plus
-from estimation.update import MAX_STEP_S, extra_noise, interpolate, locked_out, reading_noise, reset_datum, scatter_update, weight
+from estimation.update import (
+    MAX_STEP_S,
+    extra_noise,
+    interpolate,
+    locked_out,
+    reading_noise,
+    reset_datum,
+    scatter_update,
+    weight,
+)
 
 _FUSED = int(Outcome.FUSED)
 _FUSED_LATE = int(Outcome.FUSED_LATE)
@@ -58,12 +67,13 @@ def _cache_of_these_sources() -> Iterator[None]:
         digest.update(Path(inspect.getfile(module)).read_bytes())
     digest.update(Path(__file__).read_bytes())
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(base / "deckfix" / digest.hexdigest()[:16])
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(base / "deckfix" / digest.hexdigest()[:16])
     try:
         yield
     finally:
-        numba.config.CACHE_DIR = before
+        settings.CACHE_DIR = before
 
 
 @overload(frames.compose)
@@ -145,7 +155,6 @@ def _propagate(
     total = t - clock[0]
     if total <= 0:
         return x
-    n = P.shape[0]
     steps = max(1, math.ceil(total * 1e-9 / MAX_STEP_S))
     extra = extra_noise(scatter, (t_imu - clock[1]) * 1e-9, p)
     a = clock[0]
@@ -181,7 +190,7 @@ def _fuse(
     for i in range(m):
         result[2 + i] = r[i]
         result[5 + i] = math.sqrt(S[i, i])
-    w = weight(nis, m, p)
+    w = weight(float(nis), m, p)
     outcome = _FUSED_LATE if late else _FUSED
     if w == 0.0:
         if locked_out(memory, kind, t_s, r, m, p):
@@ -288,7 +297,9 @@ class CompiledEngine:
         """Go back to a checkpoint."""
         self.state = saved.copy()
 
-    def advance(self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int) -> None:
+    def advance(
+        self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int
+    ) -> None:
         """Process the rows start..stop in order; see ``FilterPyEngine.advance``."""
         s = self.state
         out.count = _kernel(

@@ -44,7 +44,7 @@ class _Table(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=Tr
     """A table of the file."""
 
 
-class Origin(_Table):
+class Origin(_Table, frozen=True):
     """Origin of the filter's NED frame; without one it is the first good GPS fix."""
 
     latitude_deg: Annotated[
@@ -56,25 +56,34 @@ class Origin(_Table):
     ] = None
 
 
-class ImuConfig(_Table):
+class ImuConfig(_Table, frozen=True):
     """Inertial sensor. Also what the simulator draws its IMU from."""
 
     accel_noise: Annotated[
         float,
-        _positive("white noise of specific force; 0.01 means 0.01 m/s after 1 s, 0.03 m/s after 10 s", "m/s^2/rtHz"),
+        _positive(
+            "white noise of specific force; 0.01 means 0.01 m/s after 1 s, 0.03 m/s after 10 s", "m/s^2/rtHz"
+        ),
     ] = 0.01
     gyro_noise: Annotated[
-        float, _positive("white noise of angular velocity; 5e-4 means 0.03 deg after 1 s, 0.09 deg after 10 s", "rad/s/rtHz")
+        float,
+        _positive(
+            "white noise of angular velocity; 5e-4 means 0.03 deg after 1 s, 0.09 deg after 10 s",
+            "rad/s/rtHz",
+        ),
     ] = 5e-4
     accel_bias_walk: Annotated[
-        float, _not_negative("random walk of the accelerometer bias; 5e-4: 1.6 mm/s^2 after 10 s", "m/s^2/rts")
+        float,
+        _not_negative("random walk of the accelerometer bias; 5e-4: 1.6 mm/s^2 after 10 s", "m/s^2/rts"),
     ] = 5e-4
     gyro_bias_walk: Annotated[
         float, _not_negative("random walk of the gyro bias; 9e-5: 0.016 deg/s after 10 s", "rad/s/rts")
     ] = 9e-5
     accel_bias_sigma: Annotated[
         float,
-        _positive("1-sigma of the accelerometer bias at start; it cannot be told from tilt in hover", "m/s^2"),
+        _positive(
+            "1-sigma of the accelerometer bias at start; it cannot be told from tilt in hover", "m/s^2"
+        ),
     ] = 0.03
     gyro_bias_sigma: Annotated[
         float, _positive("1-sigma of the gyro bias at start when it was not averaged at rest", "rad/s")
@@ -96,14 +105,14 @@ class ImuConfig(_Table):
     ] = 3.0
 
 
-class GpsConfig(_Table):
+class GpsConfig(_Table, frozen=True):
     """GPS position and velocity."""
 
     latency_s: Annotated[float, _not_negative("age of a fix at its stamp", "s")] = 0.105
     lever_arm_m: Annotated[Vector3, _number("antenna relative to the IMU, body FRD", "m")] = (0.0, 0.0, 0.0)
     position_sigma_m: Annotated[
         float, _positive("white horizontal noise where the receiver states none, and its floor", "m")
-    ] = 0.2
+    ] = 0.1
     height_sigma_m: Annotated[
         float, _positive("white vertical noise where the receiver states none, and its floor", "m")
     ] = 3.0
@@ -122,9 +131,11 @@ class GpsConfig(_Table):
             "what the bias states carry",
             extra={"unit": "-"},
         ),
-    ] = 0.2
+    ] = 0.1
     bias: Annotated[bool, _choice("carry a slowly wandering position error as a state")] = True
-    bias_sigma_m: Annotated[float, _positive("stationary 1-sigma of the horizontal position error", "m")] = 0.7
+    bias_sigma_m: Annotated[float, _positive("stationary 1-sigma of the horizontal position error", "m")] = (
+        0.7
+    )
     height_bias_sigma_m: Annotated[
         float, _positive("stationary 1-sigma of the vertical position error", "m")
     ] = 4.0
@@ -143,7 +154,7 @@ class GpsConfig(_Table):
     ] = 5.0
 
 
-class BarometerConfig(_Table):
+class BarometerConfig(_Table, frozen=True):
     """Barometric height; its offset is a state."""
 
     use: Annotated[bool, _choice("fuse the barometer")] = True
@@ -155,7 +166,7 @@ class BarometerConfig(_Table):
     bias_sigma_m: Annotated[float, _positive("1-sigma of the offset at start, once aligned", "m")] = 3.0
 
 
-class MagnetometerConfig(_Table):
+class MagnetometerConfig(_Table, frozen=True):
     """Heading from the magnetic field."""
 
     use: Annotated[bool, _choice("fuse the magnetometer's heading")] = True
@@ -167,7 +178,7 @@ class MagnetometerConfig(_Table):
     ] = None
 
 
-class AttitudeConfig(_Table):
+class AttitudeConfig(_Table, frozen=True):
     """Attitude from the autopilot's own estimator."""
 
     use: Annotated[
@@ -179,7 +190,7 @@ class AttitudeConfig(_Table):
     yaw_sigma_rad: Annotated[float, _positive("1-sigma of yaw", "rad")] = 0.1
 
 
-class RangefinderConfig(_Table):
+class RangefinderConfig(_Table, frozen=True):
     """Downward rangefinder over a surface of known height."""
 
     use: Annotated[bool, _choice("fuse the rangefinder; needs a level surface below")] = False
@@ -190,16 +201,23 @@ class RangefinderConfig(_Table):
     surface_height_m: Annotated[float, _number("height of the surface above the origin", "m")] = 0.0
 
 
-class FilterConfig(_Table):
+class FilterConfig(_Table, frozen=True):
     """The filter itself."""
 
     window_s: Annotated[
         float,
-        Meta(ge=0.1, le=5.0, description="how late an event may be and still be fused at its own time", extra={"unit": "s"}),
+        Meta(
+            ge=0.1,
+            le=5.0,
+            description="how late an event may be and still be fused at its own time",
+            extra={"unit": "s"},
+        ),
     ] = 0.5
     huber_sigma: Annotated[
         float,
-        _positive("innovations beyond this many sigma (of equal probability in one dimension) weigh less", "-"),
+        _positive(
+            "innovations beyond this many sigma (of equal probability in one dimension) weigh less", "-"
+        ),
     ] = 3.0
     gate_sigma: Annotated[
         float,
@@ -218,12 +236,14 @@ class FilterConfig(_Table):
     ] = None
 
 
-class InitialisationConfig(_Table):
+class InitialisationConfig(_Table, frozen=True):
     """How the filter starts."""
 
     rest_s: Annotated[float, _positive("time over which rest is judged and the start averaged", "s")] = 1.0
     tilt_sigma_rad: Annotated[float, _positive("1-sigma of roll and pitch levelled at rest", "rad")] = 0.01
-    flight_tilt_sigma_rad: Annotated[float, _positive("1-sigma of roll and pitch levelled in flight", "rad")] = 0.05
+    flight_tilt_sigma_rad: Annotated[
+        float, _positive("1-sigma of roll and pitch levelled in flight", "rad")
+    ] = 0.05
     yaw_sigma_rad: Annotated[
         float, _positive("1-sigma of the first yaw from a magnetometer or another estimator", "rad")
     ] = 0.09
@@ -233,7 +253,7 @@ class InitialisationConfig(_Table):
     ] = 0.2
 
 
-class Config(_Table):
+class Config(_Table, frozen=True):
     """Everything the estimator needs to know that is not in a measurement."""
 
     origin: Origin = Origin()

@@ -199,7 +199,9 @@ class LandingEstimator:
         3; ``estimation.consistency.check_jacobian`` tests it. Raises ``ConfigError`` with the compiled engine.
         """
         if self.engine_name != "filterpy":
-            raise ConfigError(f"sensor {name!r}: needs engine='filterpy'; the compiled engine has no user models")
+            raise ConfigError(
+                f"sensor {name!r}: needs engine='filterpy'; the compiled engine has no user models"
+            )
         self._models[name] = (model, latency_s)
 
     def step(self, event: Event) -> Output:
@@ -261,7 +263,9 @@ class LandingEstimator:
         known = np.ones(len(rows), dtype=bool)
         home = self._names.clocks.index(AUTOPILOT)
         kind = rows["kind"]
-        for i in np.flatnonzero((rows["clock"] != home) | (kind == Kind.TIMESYNC) | (kind == Kind.GPS_POSITION)):
+        for i in np.flatnonzero(
+            (rows["clock"] != home) | (kind == Kind.TIMESYNC) | (kind == Kind.GPS_POSITION)
+        ):
             event = unpack(rows[i], self._names.sensors, self._names.clocks, timesync_reference)
             if isinstance(event, TimeSync):
                 self._clocks.exchange(event)
@@ -460,7 +464,9 @@ class LandingEstimator:
         """Turn the rows that were kept into records; count the inertial samples, note the resets."""
         if not self._settled:
             return np.empty(0, dtype=RECORD_DTYPE)
-        rows = Rows(np.concatenate([r.ints for r in self._settled]), np.concatenate([r.floats for r in self._settled]))
+        rows = Rows(
+            np.concatenate([r.ints for r in self._settled]), np.concatenate([r.floats for r in self._settled])
+        )
         self._settled.clear()
         imu = rows.kind == Kind.IMU
         for outcome, count in zip(*np.unique(rows.outcome[imu], return_counts=True), strict=True):
@@ -553,4 +559,3 @@ def _estimate(e: Estimates, i: int) -> Estimate:
     return Estimate(
         int(e.t_ns[i]), x[P0 : P0 + 3], x[V0 : V0 + 3], x[Q0 : Q0 + 4], e.covariance[i], x, e.sigma[i]
     )
-

@@ -44,7 +44,9 @@ class FilterPyEngine:
     ekf: ExtendedKalmanFilter
 
     @classmethod
-    def start(cls, p: Array, layout: Layout, state: FilterState, users: Mapping[int, Model] | None = None) -> FilterPyEngine:
+    def start(
+        cls, p: Array, layout: Layout, state: FilterState, users: Mapping[int, Model] | None = None
+    ) -> FilterPyEngine:
         """Return an engine at a state; imports filterpy."""
         return cls(p, layout, state, users or {}, _ekf(layout.size))
 
@@ -56,7 +58,9 @@ class FilterPyEngine:
         """Go back to a checkpoint."""
         self.state = saved.copy()
 
-    def advance(self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int) -> None:
+    def advance(
+        self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int
+    ) -> None:
         """Process the rows start..stop in order; the last must be an inertial sample.
 
         An estimate is written for each inertial sample later than ``emit_after_ns`` that begins a new period
@@ -117,7 +121,9 @@ class FilterPyEngine:
                 m = len(ru)
                 r[:m], H[:m], R[:m, :m] = ru, Hu, Ru
         else:
-            m = models.measure(kind, rows.value[i], rows.own[i], s.x, gyro, self.p, self.layout.offsets, r, H, R)
+            m = models.measure(
+                kind, rows.value[i], rows.own[i], s.x, gyro, self.p, self.layout.offsets, r, H, R
+            )
         rows.result[i] = 0.0
         rows.reset[i] = 0
         if m < 0:

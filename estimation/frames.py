@@ -230,9 +230,7 @@ def ecef_to_ned_matrix(latitude_rad: float, longitude_rad: float) -> Array:
     return m
 
 
-def geodetic_to_ned(
-    latitude_rad: float, longitude_rad: float, altitude_m: float, origin: Array
-) -> Array:
+def geodetic_to_ned(latitude_rad: float, longitude_rad: float, altitude_m: float, origin: Array) -> Array:
     """Return the NED position [m], shape (3,), of a geodetic position in the tangent plane at ``origin``.
 
     ``origin`` is latitude [rad], longitude [rad], altitude [m]. Exact (through ECEF), not a flat-Earth formula.

@@ -13,7 +13,6 @@ from typing import Protocol
 
 import numpy as np
 
-from estimation.outcome import Outcome
 from estimation.rows import Estimates, FilterState, Int, Rows
 
 IMU = 0
@@ -32,7 +31,9 @@ class Engine(Protocol):
     def load(self, saved: FilterState) -> None:
         """Go back to a checkpoint."""
 
-    def advance(self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int) -> None:
+    def advance(
+        self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int
+    ) -> None:
         """Process the rows start..stop in order, the last of which is an inertial sample."""
 
 

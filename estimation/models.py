@@ -60,7 +60,7 @@ def right_jacobian(v: Array) -> Array:
         angle = math.sqrt(angle2)
         a = (1.0 - math.cos(angle)) / angle2
         b = (angle - math.sin(angle)) / (angle2 * angle)
-    J = skew(v) * -a
+    J: Array = skew(v) * -a
     # [v]x squared is v v' - |v|^2 I.
     for i in range(3):
         for j in range(3):
@@ -70,7 +70,15 @@ def right_jacobian(v: Array) -> Array:
 
 
 def transition(
-    x: Array, gyro: Array, accel: Array, dt: float, scatter: Array, p: Array, offsets: Offsets, F: Array, Q: Array
+    x: Array,
+    gyro: Array,
+    accel: Array,
+    dt: float,
+    scatter: Array,
+    p: Array,
+    offsets: Offsets,
+    F: Array,
+    Q: Array,
 ) -> Array:
     """Propagate the nominal state over ``dt`` [s]; write the error state's transition into F and noise into Q.
 
@@ -141,11 +149,20 @@ def transition(
 
 def pressure_altitude(pressure_pa: float) -> float:
     """Return the altitude [m] of a pressure [Pa] in the International Standard Atmosphere (troposphere)."""
-    return 44330.769 * (1.0 - (pressure_pa / 101325.0) ** 0.190263)
+    return 44330.769 * (1.0 - math.pow(pressure_pa / 101325.0, 0.190263))
 
 
 def measure(
-    kind: int, value: Array, own: Array, x: Array, gyro: Array, p: Array, offsets: Offsets, r: Array, H: Array, R: Array
+    kind: int,
+    value: Array,
+    own: Array,
+    x: Array,
+    gyro: Array,
+    p: Array,
+    offsets: Offsets,
+    r: Array,
+    H: Array,
+    R: Array,
 ) -> int:
     """Write a measurement's innovation r (3,), Jacobian H (3, n) and covariance R (3, 3); return its dimension.
 

@@ -92,7 +92,11 @@ def pack_parameters(config: Config, site: Site) -> Array:
     p[GPS_BIAS_TIME], p[GPS_MAX_ACCURACY] = c.gps.bias_time_s, c.gps.max_accuracy_m
     p[GPS_BIAS_TIME_V] = c.gps.height_bias_time_s
     p[GPS_RESET_AFTER] = c.gps.reset_after_s
-    p[BARO_USE], p[BARO_SIGMA], p[BARO_BIAS_WALK] = c.barometer.use, c.barometer.sigma_m, c.barometer.bias_walk
+    p[BARO_USE], p[BARO_SIGMA], p[BARO_BIAS_WALK] = (
+        c.barometer.use,
+        c.barometer.sigma_m,
+        c.barometer.bias_walk,
+    )
     p[MAG_USE], p[MAG_SIGMA] = c.magnetometer.use, c.magnetometer.heading_sigma_rad
     p[DECLINATION] = site.declination_rad
     p[ATTITUDE_USE] = c.attitude.use == "fuse"

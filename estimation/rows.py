@@ -141,12 +141,16 @@ class Estimates:
     @classmethod
     def empty(cls, n: int, size: int) -> Estimates:
         """Return room for n estimates with an error state of ``size``."""
-        return cls(np.zeros(n, dtype=np.int64), np.zeros((n, NOMINAL_SIZE)), np.zeros((n, size)), np.zeros((n, 9, 9)))
+        return cls(
+            np.zeros(n, dtype=np.int64), np.zeros((n, NOMINAL_SIZE)), np.zeros((n, size)), np.zeros((n, 9, 9))
+        )
 
     def filled(self) -> Estimates:
         """Return copies of the rows that are filled."""
         c = self.count
-        return Estimates(self.t_ns[:c].copy(), self.x[:c].copy(), self.sigma[:c].copy(), self.covariance[:c].copy(), c)
+        return Estimates(
+            self.t_ns[:c].copy(), self.x[:c].copy(), self.sigma[:c].copy(), self.covariance[:c].copy(), c
+        )
 
     @staticmethod
     def concatenate(parts: list[Estimates], size: int) -> Estimates:
@@ -181,5 +185,10 @@ class FilterState:
     def copy(self) -> FilterState:
         """Return an independent copy."""
         return FilterState(
-            self.clock.copy(), self.x.copy(), self.P.copy(), self.imu.copy(), self.scatter.copy(), self.memory.copy()
+            self.clock.copy(),
+            self.x.copy(),
+            self.P.copy(),
+            self.imu.copy(),
+            self.scatter.copy(),
+            self.memory.copy(),
         )

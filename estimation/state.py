@@ -56,9 +56,7 @@ BLOCKS: tuple[tuple[str, tuple[str, ...], str], ...] = (
 """Name, components and unit of each block, in the order of the constants above."""
 
 SIZES: tuple[int, ...] = tuple(len(components) for _, components, _ in BLOCKS)
-NOMINAL: tuple[int, ...] = tuple(
-    sum(SIZES[:b]) + (1 if b > ATTITUDE else 0) for b in range(len(SIZES))
-)
+NOMINAL: tuple[int, ...] = tuple(sum(SIZES[:b]) + (1 if b > ATTITUDE else 0) for b in range(len(SIZES)))
 """First place of each block in the nominal state."""
 NOMINAL_SIZE = sum(SIZES) + 1
 

@@ -87,7 +87,7 @@ def reading_noise(memory: Array, t_s: float, innovation: float, variance: float)
         memory[8] = variance
     memory[6] = t_s
     memory[7] = innovation
-    return max(memory[8], variance)
+    return float(max(memory[8], variance))
 
 
 def weight(nis: float, dimension: int, p: Array) -> float:
@@ -123,7 +123,7 @@ def locked_out(memory: Array, kind: int, t_s: float, r: Array, dimension: int, p
     memory[2] = t_s
     for i in range(dimension):
         memory[3 + i] = r[i]
-    return memory[0] >= RESET_COUNT and t_s - memory[1] >= p[par.GPS_RESET_AFTER]
+    return bool(memory[0] >= RESET_COUNT and t_s - memory[1] >= p[par.GPS_RESET_AFTER])
 
 
 def reset_datum(kind: int, x: Array, P: Array, r: Array, R: Array, dimension: int, offsets: Offsets) -> None:
