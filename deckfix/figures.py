@@ -147,7 +147,7 @@ def innovations(result: Result, sensor: str) -> Figure:
     spread = np.log10(np.percentile(nis, (3.0, 99.9))) if len(nis) else np.zeros(2)
     bottom = max(min(np.log10(low) - 0.3, float(spread[0])), -4.0)
     top = max(float(spread[1]) + 0.2, np.log10(high) + 0.4)
-    axes["yaxis2"] |= {"type": "log", "range": [bottom, top], "dtick": 1}
+    axes["yaxis2"] |= {"type": "log", "range": [bottom, top], "dtick": 1, "exponentformat": "power"}
     shape = {
         "type": "rect", "xref": "x2 domain", "yref": "y2", "x0": 0, "x1": 1, "y0": low, "y1": high,
         "fillcolor": rgba("#2a7f62", 0.13), "line": {"width": 0}, "layer": "below",

@@ -100,7 +100,9 @@ def verdict(result: Result, found: list[Finding]) -> str:
     if warnings:
         deserve = "deserves" if warnings == 1 else "deserve"
         return f"The estimate is usable; {_count(warnings, 'thing')} {deserve} a look."
-    return "The estimate is consistent with its sensors; nothing went wrong that can be seen from the log."
+    if found:
+        return f"Nothing went wrong that can be seen from the log; {_count(len(found), 'note')} below."
+    return "Nothing went wrong that can be seen from the log."
 
 
 def _count(n: int, noun: str) -> str:

@@ -20,7 +20,7 @@ Times = NDArray[np.int64]
 LONGEST_BRIDGE_S = 0.5
 """A reference is interpolated across gaps up to this long, and not beyond."""
 
-TOUCHDOWN_STEP_MPS = 0.25
+TOUCHDOWN_STEP_MPS = 0.15
 TOUCHDOWN_TIME_S = 0.05
 TOUCHDOWN_HEIGHT_M = 0.12
 
@@ -144,10 +144,10 @@ def window(start_ns: int, end_ns: int, contact_ns: int | None) -> Window:
 def contact_time_ns(truth: Trajectory, platform: Trajectory | None = None) -> int | None:
     """Return when the vehicle touched down, from the truth alone; None where it did not.
 
-    After the highest point: the most abrupt arrest of the descent, if the downward velocity falls by at
-    least 0.25 m/s within 50 ms (twice what rotors can do; true of any contact that is not a feather's, deck
-    moving or not). Without one: the first time from which the height above the starting level, or above the
-    platform where its truth is given, stays below 0.12 m.
+    After the highest point: the most abrupt arrest of the descent, where the downward velocity falls by at
+    least 0.15 m/s within 50 ms (3 m/s^2 at once, which only a touchdown does; the deck may move or not).
+    Without one: the first time from which the height above the starting level, or above the platform where its
+    truth is given, stays below 0.12 m.
     """
     if truth.position_m is None:
         return None

@@ -250,7 +250,7 @@ def _ratio_table(result: Result) -> str:
         size = np.sqrt(len(axes))
         both = [(rms(getattr(e, quantity)[inside][:, axes]) or 0.0) * factor * size for e in (ours, theirs)]
         cells = [
-            name.replace("_", " "),
+            _RATIO_WORDS.get(name, name.replace("_", " ")),
             f"{both[0]:.3f} {unit}",
             f"{both[1]:.3f} {unit}",
             f"{ratios[name]:.2f}",
