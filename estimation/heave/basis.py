@@ -46,8 +46,9 @@ class Basis:
 
     def _drift(self) -> tuple[Array, Array]:
         """Angular rates and scales of the drift columns."""
-        order = (np.arange(1, self.drift_count + 1) - 0.5) * np.pi
-        return order / self.drift_span_s, np.sqrt(2.0 * self.drift_span_s) / order
+        order = np.asarray(np.arange(1, self.drift_count + 1) - 0.5, np.float64) * np.pi
+        scale: Array = np.sqrt(2.0 * self.drift_span_s) / order
+        return order / self.drift_span_s, scale
 
 
 def dense_basis(
@@ -60,7 +61,7 @@ def dense_basis(
     spacing = 1.0 / (2.0 * (span_s + horizon_s))
     top = min(highest_hz, 0.45 / interval_s) if interval_s > 0 else highest_hz
     first, last = max(1, round(lowest_hz / spacing)), int(top / spacing)
-    frequency = np.arange(first, last + 1) * spacing
+    frequency = np.arange(first, last + 1, dtype=np.float64) * spacing
     reach = span_s + horizon_s + 10.0
     count = max(1, round(2.0 * reach * lowest_hz))
     return Basis(frequency, -span_s - 5.0, reach, count)

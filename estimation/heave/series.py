@@ -55,13 +55,15 @@ def cut_window(
     """Check a series and average it in bins of ``bin_s``, weighted by its variances.
 
     ``t_s`` (n,) times [s], oldest first, irregular and with gaps as they come; ``heave_m`` (n,) [m], up;
-    ``sigma_m`` scalar or (n,) 1 sigma [m]. Samples that are not finite are left out and counted; those older than
-    ``window_s`` before the last are left out. Raises ValueError naming the argument that cannot be used.
+    ``sigma_m`` scalar or (n,) 1 sigma [m]. Samples that are not finite are left out and counted; those older
+    than ``window_s`` before the last are left out. Raises ValueError naming the argument that cannot be used.
     """
     t, value = np.asarray(t_s, np.float64), np.asarray(heave_m, np.float64)
     sigma = np.asarray(sigma_m, np.float64)
     if t.ndim != 1 or t.shape != value.shape:
-        raise ValueError(f"heave_m: shape {value.shape} does not fit t_s of shape {t.shape}; both must be (n,)")
+        raise ValueError(
+            f"heave_m: shape {value.shape} does not fit t_s of shape {t.shape}; both must be (n,)"
+        )
     if sigma.ndim and sigma.shape != t.shape:
         raise ValueError(f"sigma_m: shape {sigma.shape} is neither scalar nor that of t_s {t.shape}")
     if not window_s > 0 or not bin_s >= 0:
@@ -75,7 +77,9 @@ def cut_window(
         raise ValueError("sigma_m: must be positive; give the 1 sigma of each sample in metres")
     if np.any(np.diff(t) < 0):
         k = int(np.argmax(np.diff(t) < 0)) + 1
-        raise ValueError(f"t_s: must be oldest first, but sample {k} is earlier than the one before it; sort it")
+        raise ValueError(
+            f"t_s: must be oldest first, but sample {k} is earlier than the one before it; sort it"
+        )
     dropped, last = int(len(finite) - len(t)), float(t[-1])
     t = t - last
     recent = t >= -window_s

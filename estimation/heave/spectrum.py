@@ -1,18 +1,18 @@
 """Learning a smooth spectrum of the sea from a minute of noisy heave.
 
-The series is a sum of harmonics on a dense frequency grid whose coefficients are Gaussian with variances s_j, the
-spectrum, plus a level and a slow drift (Bayesian harmonic regression). The spectrum is
+The series is a sum of harmonics on a dense frequency grid whose coefficients are Gaussian with variances s_j,
+the spectrum, plus a level and a slow drift (Bayesian harmonic regression). The spectrum is
 
     s(f) = (floor + J_1(f) + J_2(f)) exp(sum_k c_k B_k(f)),
 
 two JONSWAP-like peaks, each with its own peakedness and fall-off, times a smooth positive correction. All
 parameters and the drift's size are found together by maximising the exact marginal likelihood of the samples,
-with its gradient, under priors that hold the correction near one and the peaks near the shape of a wind sea on
-a small raft: the fewer the data, the closer the result stays to the parametric form. What is left uncertain of
-the spectrum enters the coefficients' covariance by the delta method.
+with its gradient, under priors that hold the correction near one and the peaks near the shape of a wind sea
+on a small raft: the fewer the data, the closer the result stays to the parametric form. What is left
+uncertain of the spectrum enters the coefficients' covariance by the delta method.
 
-The likelihood is evaluated in a compressed space: the samples are projected on the few hundred directions that
-the band can excite within the window.
+The likelihood is evaluated in a compressed space: the samples are projected on the few hundred directions
+that the band can excite within the window.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class SpectrumSettings:
     bump_ratio: float = 0.1
     level_sigma_m: float = 10.0
     drift_mps: float = 0.003
-    """Median of the prior of the drift's size [m per root second]: 0.003 means 3 mm after 1 s, 9 mm after 10 s."""
+    """Median of the drift's prior size [m per root second]: 0.003 is 3 mm after 1 s, 9 mm after 10 s."""
     drift_log_sigma: float = 1.5
     iterations: int = 30
     warm_iterations: int = 12
@@ -61,8 +61,8 @@ class SpectrumSettings:
 class LearnedSpectrum:
     """A spectrum and the coefficients that it gives for one window.
 
-    ``power_m2`` (m,) variance of each harmonic; ``mean`` (k,) and ``covariance`` (k, k) of all coefficients of
-    ``basis``; ``parameters`` for the next warm start; ``drift_mps`` [m per root second].
+    ``power_m2`` (m,) variance of each harmonic; ``mean`` (k,) and ``covariance`` (k, k) of all coefficients
+    of ``basis``; ``parameters`` for the next warm start; ``drift_mps`` [m per root second].
     """
 
     basis: Basis
@@ -88,19 +88,18 @@ class _Problem:
         return np.concatenate([power, power, [self.level_variance], drift])
 
     def evidence(self, prior: Array) -> tuple[float, Array, Array, Array]:
-        """Negative log likelihood, its gradient per prior variance (k,), whitened columns (r, k), U'K^-1 y."""
-        from scipy.linalg import lapack
+        """Negative log likelihood, gradient per prior variance (k,), whitened columns (r, k), U'K^-1 y."""
+        from scipy.linalg import blas, lapack
 
         u = self.columns
-        k = (u * prior) @ u.T
+        k = blas.dsyrk(1.0, u * np.sqrt(prior), lower=1)
         k[np.diag_indices_from(k)] += 1.0
-        lower, info = lapack.dpotrf(k, lower=1, clean=1)
+        lower, info = lapack.dpotrf(k, lower=1, overwrite_a=1)
         if info:
             raise np.linalg.LinAlgError("the covariance of the heave samples is not positive definite")
         solved, _ = lapack.dpotrs(lower, self.data, lower=1)
         value = 0.5 * float(self.data @ solved) + float(np.log(np.diag(lower)).sum())
-        inverse, _ = lapack.dtrtri(lower, lower=1)
-        whitened = inverse @ u
+        whitened = blas.dtrsm(1.0, lower, u, lower=1)
         score = u.T @ solved
         return value, 0.5 * (np.einsum("ij,ij->j", whitened, whitened) - score**2), whitened, score
 
@@ -127,7 +126,7 @@ class _Shape:
 
 
 def _peak(frequency: Array, p: Array) -> tuple[Array, Array]:
-    """JONSWAP's form with fall-off f^-n: value (m,) and derivatives (4, m) by log power, log fp, log gamma, n."""
+    """JONSWAP's form with fall-off f^-n: value (m,), derivatives (4, m) by log power, log fp, log gamma, n."""
     x = frequency / math.exp(p[1])
     width = np.where(x <= 1.0, 0.07, 0.09)
     log_x, x4 = np.log(x), np.minimum(x**-4.0, 1e3)
@@ -154,9 +153,7 @@ def learn(
 
     settings = settings or SpectrumSettings()
     span = grid_span(window)
-    basis = dense_basis(
-        span, window.interval_s, settings.lowest_hz, settings.highest_hz, settings.horizon_s
-    )
+    basis = dense_basis(span, window.interval_s, settings.lowest_hz, settings.highest_hz, settings.horizon_s)
     problem = _compress(window, basis, settings)
     bumps = _bumps(basis.frequency_hz, span, settings)
     first, top = _first_guess(window, basis, settings)
@@ -188,10 +185,13 @@ def learn(
 
     start = np.clip(np.concatenate([first, [log_drift], np.zeros(bumps.shape[1])]), low, high)
     iterations = settings.iterations
-    if previous is not None and previous.parameters.shape == start.shape:
-        warm = np.clip(previous.parameters, low, high)
+    if previous is not None:
+        same = previous.parameters.shape == start.shape
+        warm = previous.parameters if same else np.append(previous.parameters[: where + 1], 0.0 * bumps[0])
+        warm = np.clip(warm, low, high)
         if objective(warm)[0] < objective(start)[0]:
-            start, iterations = warm, settings.warm_iterations
+            start = warm
+            iterations = settings.warm_iterations if same else iterations
     found = minimize(
         objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations}
     )
@@ -202,7 +202,7 @@ def learn(
 
 
 def _compress(window: Window, basis: Basis, settings: SpectrumSettings) -> _Problem:
-    """Whiten, and project on harmonics at the spacing of a slightly longer window: nothing of the band is lost."""
+    """Whiten, and project on harmonics spaced as for a slightly longer window: the whole band is kept."""
     weight = 1.0 / np.sqrt(window.variance_m2)[:, None]
     extended = 1.15 * grid_span(window) + 2.0
     frequency = np.arange(0.0, basis.frequency_hz[-1] + 1.5 / extended, 1.0 / extended)
@@ -212,7 +212,7 @@ def _compress(window: Window, basis: Basis, settings: SpectrumSettings) -> _Prob
     if frame.shape[1] < frame.shape[0]:
         q, _ = np.linalg.qr(weight * frame)
         columns, data = q.T @ columns, q.T @ data
-    return _Problem(columns, data, len(basis.frequency_hz), settings.level_sigma_m**2)
+    return _Problem(np.asfortranarray(columns), data, len(basis.frequency_hz), settings.level_sigma_m**2)
 
 
 def _bumps(frequency: Array, span_s: float, settings: SpectrumSettings) -> Array:
@@ -231,7 +231,9 @@ def _bumps(frequency: Array, span_s: float, settings: SpectrumSettings) -> Array
 def _first_guess(window: Window, basis: Basis, settings: SpectrumSettings) -> tuple[Array, float]:
     """Two peaks from a Hann-tapered periodogram, and the log of the largest power on the grid."""
     t, span = window.time_s, max(window.span_s, 5.0)
-    taper = 0.5 - 0.5 * np.cos(2.0 * np.pi * (t - t[0] + 0.5 * window.interval_s) / (span + window.interval_s))
+    taper = 0.5 - 0.5 * np.cos(
+        2.0 * np.pi * (t - t[0] + 0.5 * window.interval_s) / (span + window.interval_s)
+    )
     frequency = np.arange(1, max(3, int(basis.frequency_hz[-1] * span)) + 1) / span
     frequency = frequency[(frequency >= settings.lowest_hz) & (frequency <= basis.frequency_hz[-1])]
     level = float(taper @ window.value_m / taper.sum())
@@ -252,9 +254,9 @@ def _posterior(
 ) -> tuple[Array, Array]:
     """Mean (k,) and covariance (k, k) of the coefficients, the spectrum's own uncertainty included.
 
-    With S the prior variances, W = U' K^-1 U and g = U' K^-1 y the mean is S g and the covariance S - S W S. The
-    parameters' covariance is the inverse of Fisher's information 1/2 D (W o W) D' plus their prior; it enters
-    through the mean's derivative by them (the empirical-Bayes correction of Kass and Steffey, 1989).
+    With S the prior variances, W = U' K^-1 U and g = U' K^-1 y the mean is S g and the covariance S - S W S.
+    The parameters' covariance is the inverse of Fisher's information 1/2 D (W o W) D' plus their prior; it
+    enters through the mean's derivative by them (the empirical-Bayes correction of Kass and Steffey, 1989).
     """
     prior = problem.prior(power, drift_variance)
     _, _, whitened, score = problem.evidence(prior)
