@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 from deckfix._version import __version__
 
 if TYPE_CHECKING:
-    from deckfix.replay import open, replay
+    from deckfix.replaying import open, replay
     from deckfix.result import Result
 
 __all__ = ["Result", "__version__", "open", "replay"]
 
-_HOMES = {"open": "deckfix.replay", "replay": "deckfix.replay", "Result": "deckfix.result"}
+_HOMES = {"open": "deckfix.replaying", "replay": "deckfix.replaying", "Result": "deckfix.result"}
 
 
 def __getattr__(name: str) -> Any:

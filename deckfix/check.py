@@ -30,7 +30,7 @@ def check_replay(
 
     Returns whether all are equal, and sentences for the user.
     """
-    from deckfix.replay import replay
+    from deckfix.replaying import replay
 
     if result.source is None:
         raise ValueError("this result did not come from a log")

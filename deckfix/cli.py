@@ -17,16 +17,24 @@ from typing import Any
 import click
 
 from deckfix._version import __version__
+from deckfix.cli_vision import calibrate, target
 
+_ENGINE = click.option(
+    "--engine", type=click.Choice(["auto", "filterpy", "compiled"]), default="auto", show_default=True,
+    help="auto takes compiled where numba is installed.",
+)  # fmt: skip
 _FORCE = click.option("--force", is_flag=True, help="Overwrite output files that exist.")
 
 
+_ORDER = ("demo", "simulate", "import", "info", "replay", "report", "export", "target", "calibrate")
+
+
 class _Ordered(click.Group):
-    """A group that lists its commands in the order in which they are written here."""
+    """A group that lists its commands in the order in which they are used, the rest as they were added."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of the commands."""
-        return list(self.commands)
+        return sorted(self.commands, key=lambda name: _ORDER.index(name) if name in _ORDER else len(_ORDER))
 
 
 @click.group(
@@ -49,8 +57,8 @@ def deckfix() -> None:
 def import_(files: tuple[str, ...], output: str, system: int | None, force: bool) -> None:
     """Turn flight logs into one MCAP log.
 
-    Takes ArduPilot .BIN and .log, MAVLink .tlog, PX4 .ulg and ROS 2 .mcap; several files of one flight (a
-    .BIN and its .tlog) are joined by their clocks.
+    Takes ArduPilot .BIN and .log, MAVLink .tlog and PX4 .ulg; an autopilot's log and the telemetry log of the
+    same flight are joined by their clocks.
     """
     from deckfix.importing import import_flight
 
@@ -74,10 +82,7 @@ def info(file: str) -> None:
 @click.option(
     "--config", "config_path", metavar="C.toml", help="Configuration (default: the log's own, else built in)."
 )
-@click.option(
-    "--engine", type=click.Choice(["auto", "filterpy", "compiled"]), default="auto", show_default=True,
-    help="auto takes compiled where numba is installed.",
-)  # fmt: skip
+@_ENGINE
 @click.option(
     "--check", is_flag=True, help="Replay twice and compare with recorded estimates: bytes must be equal."
 )
@@ -107,15 +112,16 @@ def replay(
 @deckfix.command()
 @click.argument("file", metavar="F.mcap")
 @click.option("-o", "--output", required=True, metavar="R.html", help="The page to write.")
+@_ENGINE
 @_FORCE
-def report(file: str, output: str, force: bool) -> None:
+def report(file: str, output: str, engine: str, force: bool) -> None:
     """Write the report of a flight as one HTML page.
 
-    A log without estimates is replayed first, with its own configuration.
+    The log is replayed with its own configuration, or else the default one.
     """
     from deckfix.commands import report_command
 
-    _say(report_command(file, output, force=force))
+    _say(report_command(file, output, engine=engine, force=force))
 
 
 @deckfix.command()
@@ -146,6 +152,18 @@ def recover(file: str, output: str, force: bool) -> None:
 
 
 @deckfix.command()
+@click.argument("scenario")
+@click.option("-o", "--output", required=True, metavar="F.mcap", help="The log to write.")
+@click.option("--seed", type=int, help="Of the flight (default: the scenario's).")
+@_FORCE
+def simulate(scenario: str, output: str, seed: int | None, force: bool) -> None:
+    """Write the log of a simulated flight: a scenario's name or TOML file, and a seed."""
+    from deckfix.demo import simulate_flight
+
+    _say(simulate_flight(scenario, output, seed=seed, force=force))
+
+
+@deckfix.command()
 def doctor() -> None:
     """Check the installation and say what is wrong with it."""
     from deckfix.doctor import examine
@@ -167,6 +185,10 @@ def demo(output: str, seed: int, force: bool) -> None:
     from deckfix.demo import run_demo
 
     _say(run_demo(output, seed=seed, force=force))
+
+
+deckfix.add_command(target)
+deckfix.add_command(calibrate)
 
 
 def _say(text: str) -> None:

@@ -28,7 +28,7 @@ def replay_command(
     force: bool,
 ) -> tuple[str, bool]:
     """Replay a log, write what was asked for, and return the text to show and whether the check held."""
-    from deckfix.replay import replay
+    from deckfix.replaying import replay
 
     existing(file)
     inputs = [file, *([config] if config else [])]
@@ -58,14 +58,14 @@ def replay_command(
     return "\n".join(lines), equal
 
 
-def report_command(file: str, output: str, *, force: bool) -> str:
+def report_command(file: str, output: str, *, engine: str = "auto", force: bool = False) -> str:
     """Write the report of a log, replaying it with its own configuration, and return the text to show."""
-    from deckfix.replay import replay
+    from deckfix.replaying import replay
 
     existing(file)
     check_output(output, force=force, inputs=[file])
     with working(f"replaying {Path(file).name}"):
-        result = replay(file)
+        result = replay(file, engine=cast("EngineName", engine))
     write_text(output, result.report(), force=force, inputs=[file])
     return f"{digest(result)}\nwrote {output}"
 

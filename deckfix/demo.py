@@ -1,61 +1,58 @@
-"""The command ``demo``: a simulated landing, replayed, with its report; needs no data."""
+"""The commands ``simulate`` and ``demo``: a flight from nothing but a scenario and a seed."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from deckfix.commands import digest, write_text
-from deckfix.files import OutputError, check_output
+from deckfix.files import OutputError, check_output, output_file
 from deckfix.progress import working
 
-SCENARIO = "landing_2026_06"
-FLIGHT, REPLAY, REPORT = "flight.mcap", "replay.mcap", "report.html"
+DEMO_SCENARIO = "landing_2026_06"
 
 
-def run_demo(folder: str | Path, *, seed: int = 1, force: bool = False) -> str:
-    """Simulate a landing on a heaving platform, replay it, write its report, and return the text to show.
+def simulate_flight(
+    scenario: str, output: str | Path, *, seed: int | None = None, force: bool = False
+) -> str:
+    """Write the log of a simulated flight, and return what there is to say.
 
-    Writes ``flight.mcap``, ``replay.mcap`` and ``report.html`` into the folder, which is made where it is
-    missing. The same seed gives the same estimates. Raises ``deckfix.files.OutputError`` where a file
-    exists and ``force`` is not set, or the folder cannot be made.
+    ``scenario`` is the name of one that comes with the product, or the path of a TOML file. Raises
+    ``estimation.config.ConfigError`` for the scenario, ``deckfix.files.OutputError`` for the output.
     """
-    from deckfix.replaying import replay
     from logs.writer import FlightWriter
     from simulation.flight import load_scenario, simulate
 
-    place = _folder(folder)
-    paths = [place / name for name in (FLIGHT, REPLAY, REPORT)]
-    for path in paths:
-        check_output(path, force=force)
-    scenario = load_scenario(SCENARIO)
-    with working("simulating"):
-        flight = simulate(scenario, seed)
-        with FlightWriter(paths[0], force=force) as writer:
-            writer.write_recording(flight.recording())
-    with working("replaying"):
-        result = replay(paths[0])
-        result.write(paths[1], force=force, inputs=[str(paths[0])])
-    with working("writing the report"):
-        write_text(paths[2], result.report(), force=force, inputs=[str(p) for p in paths[:2]])
-    plan, sea = flight.trajectory.plan, flight.trajectory.platform.sea
-    return "\n".join(
-        [
-            f"simulated: {scenario.description}",
-            f"  {plan.duration_s:.0f} s, significant wave height {sea.significant_height_m:.2f} m, seed {seed}, "
-            f"{len(flight.batch)} sensor messages",
-            digest(result),
-            f"  the flight:    {paths[0]}",
-            f"  its replay:    {paths[1]}",
-            f"  the report:    {paths[2]} (open it in a browser)",
-        ]
-    )
+    inputs = [scenario] if scenario.endswith(".toml") else []
+    with output_file(output, force=force, inputs=inputs) as partial:
+        with working(f"simulating {scenario}"):
+            flight = simulate(load_scenario(scenario), seed)
+            recording = flight.recording()
+        with working(f"writing {Path(output).name}"), FlightWriter(partial, force=True) as writer:
+            writer.write_recording(recording)
+    return f"wrote {output}: {flight.scenario.description} ({len(flight.batch):,} events, seed {flight.seed})"
 
 
-def _folder(folder: str | Path) -> Path:
-    place = Path(folder)
+def run_demo(folder: str | Path, *, seed: int = 1, force: bool = False) -> str:
+    """Simulate a landing, replay it, write log, estimates and report to a folder, and say where they are.
+
+    The reference engine is used: it starts at once, whereas the compiled one is compiled at its first use.
+    """
+    from deckfix.replaying import replay
+
+    target = Path(folder)
+    if target.exists() and not target.is_dir():
+        raise OutputError(f"{target}: is a file; give a folder")
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise OutputError(f"{place}: cannot be made a folder ({reason}); give another") from None
-    return place
+        raise OutputError(f"{target}: cannot be created ({error.strerror}); choose another") from None
+    log, estimate, page = (target / name for name in ("flight.mcap", "estimate.mcap", "report.html"))
+    for path in (log, estimate, page):
+        check_output(path, force=force)
+    said = [simulate_flight(DEMO_SCENARIO, log, seed=seed, force=force)]
+    with working("replaying"):
+        result = replay(log, engine="filterpy")
+    result.write(estimate, force=force)
+    write_text(page, result.report(), force=force)
+    said += [digest(result), f"wrote {estimate}", f"wrote {page}: open it in a browser"]
+    return "\n".join(said)

@@ -39,7 +39,7 @@ def write(
     Raises ``deckfix.files.OutputError`` where the file may not be written, and ``ValueError`` for a result
     that did not come from a log.
     """
-    from deckfix.replay import CONFIG_NAME
+    from deckfix.replaying import CONFIG_NAME
     from logs.writer import FlightWriter
 
     flight = result.source
@@ -59,7 +59,7 @@ def copy_source(flight: Flight, writer: FlightWriter) -> None:
     """Copy metadata, attachments and messages of a log, in the order of their arrival, without our own
     topics.
     """
-    from deckfix.replay import CONFIG_NAME
+    from deckfix.replaying import CONFIG_NAME
     from logs.writer import CLOCKS
 
     for name, entries in flight.metadata.items():
