@@ -170,27 +170,33 @@ def _propagate(
 
 def _fuse(
     x: Array, P: Array, memory: Array, kind: int, value: Array, own: Array, gyro: Array, t_s: float, late: int,
-    p: Array, offsets: Offsets, H3: Array, result: Array,
+    p: Array, offsets: Offsets, H: Array, result: Array,
 ) -> tuple[int, int, Array]:  # fmt: skip
     n = P.shape[0]
-    r3 = np.zeros(3)
-    R3 = np.zeros((3, 3))
+    r = np.zeros(3)
+    R = np.zeros((3, 3))
     result[:] = 0.0
-    m = measure(kind, value, own, x, gyro, p, offsets, r3, H3, R3)
+    m = measure(kind, value, own, x, gyro, p, offsets, r, H, R)
     if m < 0:
         return -m, 0, x
-    r, H, R = r3[:m], np.ascontiguousarray(H3[:m]), R3[:m, :m].copy()
     if kind == BAROMETER:
         R[0, 0] = reading_noise(memory, t_s, r[0], R[0, 0])
-    PHt = P @ H.T
-    S = H @ PHt + R
-    nis = r @ np.linalg.solve(S, r)
-    result[0] = nis
-    result[1] = m
+    PHt = np.zeros((n, 3))
+    for i in range(n):
+        for j in range(m):
+            for k in range(n):
+                PHt[i, j] += P[i, k] * H[j, k]
+    S = _innovation_covariance(H, PHt, R, 1.0, m)
+    inverse = _inverse(S, m)
+    nis = 0.0
     for i in range(m):
+        for j in range(m):
+            nis += r[i] * inverse[i, j] * r[j]
         result[2 + i] = r[i]
         result[5 + i] = math.sqrt(S[i, i])
-    w = weight(float(nis), m, p)
+    result[0] = nis
+    result[1] = m
+    w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     if w == 0.0:
         if locked_out(memory, kind, t_s, r, m, p):
@@ -201,24 +207,103 @@ def _fuse(
     memory[0] = 0.0
     if w < 1.0:
         outcome = _DOWNWEIGHTED
-        R = R / w
-        S = H @ PHt + R
-    K = PHt @ np.linalg.inv(S)
-    error = K @ r
-    # Joseph's form (I - KH) P (I - KH)' + K R K', with the products in the cheap order.
-    B = P - K @ PHt.T
-    J = B - (B @ H.T) @ K.T + (K @ R) @ K.T
-    x = plus(x, error, offsets)
-    att = offsets[ATTITUDE]
-    G = right_jacobian(error[att : att + 3])
-    J[att : att + 3, :] = G @ J[att : att + 3, :]
-    J[:, att : att + 3] = np.ascontiguousarray(J[:, att : att + 3]) @ G.T
+        inverse = _inverse(_innovation_covariance(H, PHt, R, 1.0 / w, m), m)
+    K = np.zeros((n, 3))
+    error = np.zeros(n)
     for i in range(n):
-        for j in range(n):
-            P[i, j] = 0.5 * (J[i, j] + J[j, i])
-    return outcome, 0, x
+        for j in range(m):
+            for k in range(m):
+                K[i, j] += PHt[i, k] * inverse[k, j]
+            error[i] += K[i, j] * r[j]
+    _joseph(P, K, H, R, 1.0 / w, m)
+    att = offsets[ATTITUDE]
+    _reset_attitude(P, right_jacobian(error[att : att + 3]), att)
+    return outcome, 0, plus(x, error, offsets)
 
 
+def _innovation_covariance(H: Array, PHt: Array, R: Array, scale: float, m: int) -> Array:
+    """Return H P H' + scale R, (3, 3) of which m rows are used."""
+    S = np.zeros((3, 3))
+    for i in range(m):
+        for j in range(m):
+            S[i, j] = scale * R[i, j]
+            for k in range(PHt.shape[0]):
+                S[i, j] += H[i, k] * PHt[k, j]
+    return S
+
+
+def _inverse(S: Array, m: int) -> Array:
+    """Return the inverse of the leading (m, m) part of a positive definite matrix, by Gauss-Jordan."""
+    A = S.copy()
+    B = np.eye(3)
+    for c in range(m):
+        scale = 1.0 / A[c, c]
+        for j in range(m):
+            A[c, j] *= scale
+            B[c, j] *= scale
+        for i in range(m):
+            if i != c:
+                f = A[i, c]
+                for j in range(m):
+                    A[i, j] -= f * A[c, j]
+                    B[i, j] -= f * B[c, j]
+    return B
+
+
+def _joseph(P: Array, K: Array, H: Array, R: Array, scale: float, m: int) -> None:
+    """Replace P by (I - KH) P (I - KH)' + K scale R K', and symmetrise it."""
+    n = P.shape[0]
+    B = P.copy()
+    for j in range(m):
+        HP = np.zeros(n)
+        for k in range(n):
+            h = H[j, k]
+            if h != 0.0:
+                for c in range(n):
+                    HP[c] += h * P[k, c]
+        for i in range(n):
+            for c in range(n):
+                B[i, c] -= K[i, j] * HP[c]
+    # Columns: B (I - KH)' = B - (B H') K'; then the noise.
+    C = np.zeros((n, 3))
+    for i in range(n):
+        for j in range(m):
+            for k in range(n):
+                C[i, j] -= B[i, k] * H[j, k]
+            for k in range(m):
+                C[i, j] += scale * K[i, k] * R[k, j]
+    for i in range(n):
+        for c in range(n):
+            for j in range(m):
+                B[i, c] += C[i, j] * K[c, j]
+    for i in range(n):
+        for c in range(n):
+            P[i, c] = 0.5 * (B[i, c] + B[c, i])
+
+
+def _reset_attitude(P: Array, G: Array, att: int) -> None:
+    """Carry the attitude's covariance over to the new nominal attitude: G P G', G (3, 3) on its three entries."""
+    n = P.shape[0]
+    old = np.empty(3)
+    for c in range(n):
+        for i in range(3):
+            old[i] = P[att + i, c]
+        for i in range(3):
+            P[att + i, c] = G[i, 0] * old[0] + G[i, 1] * old[1] + G[i, 2] * old[2]
+    for c in range(n):
+        for i in range(3):
+            old[i] = P[c, att + i]
+        for i in range(3):
+            P[c, att + i] = G[i, 0] * old[0] + G[i, 1] * old[1] + G[i, 2] * old[2]
+    for i in range(n):
+        for c in range(i):
+            mean = 0.5 * (P[i, c] + P[c, i])
+            P[i, c] = mean
+            P[c, i] = mean
+
+
+for _helper in (_innovation_covariance, _inverse, _joseph, _reset_attitude):
+    register_jitable(_helper)
 register_jitable(_propagate_covariance)
 register_jitable(_propagate)
 register_jitable(_fuse)

@@ -69,6 +69,27 @@ def right_jacobian(v: Array) -> Array:
     return J
 
 
+def inverse_right_jacobian(v: Array) -> Array:
+    """Return the inverse of J_r(v), for |v| < pi; shape (3, 3) (Sola, 2017, eq. 184)."""
+    angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if angle2 < 1e-6:
+        b = 1.0 / 12.0 + angle2 / 720.0
+    else:
+        angle = math.sqrt(angle2)
+        b = 1.0 / angle2 - (1.0 + math.cos(angle)) / (2.0 * angle * math.sin(angle))
+    J: Array = skew(v) * 0.5
+    for i in range(3):
+        for j in range(3):
+            J[i, j] += b * v[i] * v[j]
+        J[i, i] += 1.0 - b * angle2
+    return J
+
+
+def put(target: Array, row: int, column: int, scale: float, block: Array) -> None:
+    """Write ``scale * block``, block (3, 3), into ``target`` at a row and column."""
+    target[row : row + 3, column : column + 3] = scale * block
+
+
 def transition(
     x: Array,
     gyro: Array,
@@ -110,16 +131,16 @@ def transition(
     for i in range(n):
         F[i, i] = 1.0
     A = compose(R_mid, skew(f))
-    dv_dtheta = -dt * compose(A, R_half.T)
-    dv_dbg = (0.5 * dt * dt) * compose(A, right_jacobian(0.5 * dt * w))
-    F[vel : vel + 3, att : att + 3] = dv_dtheta
-    F[vel : vel + 3, bg : bg + 3] = dv_dbg
-    F[vel : vel + 3, ba : ba + 3] = -dt * R_mid
-    F[pos : pos + 3, att : att + 3] = (0.5 * dt) * dv_dtheta
-    F[pos : pos + 3, bg : bg + 3] = (0.5 * dt) * dv_dbg
-    F[pos : pos + 3, ba : ba + 3] = (-0.5 * dt * dt) * R_mid
-    F[att : att + 3, att : att + 3] = compose(R_half, R_half).T
-    F[att : att + 3, bg : bg + 3] = -dt * right_jacobian(dt * w)
+    tilted = compose(A, R_half.T.copy())
+    turned = compose(A, right_jacobian(0.5 * dt * w))
+    put(F, vel, att, -dt, tilted)
+    put(F, vel, bg, 0.5 * dt * dt, turned)
+    put(F, vel, ba, -dt, R_mid)
+    put(F, pos, att, -0.5 * dt * dt, tilted)
+    put(F, pos, bg, 0.25 * dt * dt * dt, turned)
+    put(F, pos, ba, -0.5 * dt * dt, R_mid)
+    put(F, att, att, 1.0, compose(R_half, R_half).T.copy())
+    put(F, att, bg, -dt, right_jacobian(dt * w))
     qa = p[par.ACCEL_NOISE] ** 2 + scatter[0]
     qg = p[par.GYRO_NOISE] ** 2 + scatter[1]
     for i in range(3):
@@ -215,7 +236,7 @@ def gps_position(
         if biased:
             r[i] -= x[BP0 + i]
             H[i, offsets[GPS_BIAS] + i] = 1.0
-    H[:, offsets[ATTITUDE] : offsets[ATTITUDE] + 3] = -compose(R_nb, skew(lever))
+    put(H, 0, offsets[ATTITUDE], -1.0, compose(R_nb, skew(lever)))
     R[0, 0] = gps_variance(own[0], p[par.GPS_SIGMA_H], fraction)
     R[1, 1] = gps_variance(own[3], p[par.GPS_SIGMA_H], fraction)
     R[2, 2] = gps_variance(own[5], p[par.GPS_SIGMA_V], fraction)
@@ -237,8 +258,8 @@ def gps_velocity(
         r[i] = value[i] - x[V0 + i] - arm[i]
         H[i, offsets[VELOCITY] + i] = 1.0
     att, bg = offsets[ATTITUDE], offsets[GYRO_BIAS]
-    H[:, att : att + 3] = -compose(R_nb, skew(swing))
-    H[:, bg : bg + 3] = compose(R_nb, skew(lever))
+    put(H, 0, att, -1.0, compose(R_nb, skew(swing)))
+    put(H, 0, bg, 1.0, compose(R_nb, skew(lever)))
     R[0, 0] = gps_variance(own[0], p[par.GPS_SIGMA_VH], 1.0)
     R[1, 1] = gps_variance(own[3], p[par.GPS_SIGMA_VH], 1.0)
     R[2, 2] = gps_variance(own[5], p[par.GPS_SIGMA_VV], 1.0)
@@ -267,10 +288,10 @@ def magnetometer(value: Array, x: Array, p: Array, offsets: Offsets, r: Array, H
         return UNUSABLE_NOW  # within 6 deg of the magnetic pole's vertical: no heading in it
     angle = p[par.DECLINATION] - math.atan2(m[1], m[0])
     r[0] = (angle + math.pi) % (2.0 * math.pi) - math.pi
-    D = -compose(R_nb, skew(value[0:3]))
+    D = compose(R_nb, skew(value[0:3]))
     att = offsets[ATTITUDE]
     for j in range(3):
-        H[0, att + j] = (-m[1] * D[0, j] + m[0] * D[1, j]) / horizontal
+        H[0, att + j] = (m[1] * D[0, j] - m[0] * D[1, j]) / horizontal
     R[0, 0] = p[par.MAG_SIGMA] ** 2
     return 1
 
@@ -282,15 +303,15 @@ def attitude(value: Array, x: Array, p: Array, offsets: Offsets, r: Array, H: Ar
     norm = math.sqrt(value[0] ** 2 + value[1] ** 2 + value[2] ** 2 + value[3] ** 2)
     if not abs(norm - 1.0) < 0.1:
         return UNUSABLE_NOW
+    # d log(exp(-d) exp(r)) / d d = -J_l^-1(r), and J_l(r) = J_r(-r).
     r[:] = quat_log(quat_multiply(quat_conjugate(x[Q0 : Q0 + 4]), value[0:4] / norm))
-    inverse = right_jacobian(-r)  # d log(exp(-d) exp(r)) / d d = -J_l^-1(r) = -(J_r(-r))^-1
-    H[:, offsets[ATTITUDE] : offsets[ATTITUDE] + 3] = np.linalg.inv(inverse)
+    put(H, 0, offsets[ATTITUDE], 1.0, inverse_right_jacobian(-r))
     R_nb = quat_to_matrix(x[Q0 : Q0 + 4])
     S = np.zeros((3, 3))
     S[0, 0] = p[par.ATTITUDE_TILT] ** 2
     S[1, 1] = S[0, 0]
     S[2, 2] = p[par.ATTITUDE_YAW] ** 2
-    R[:, :] = compose(R_nb.T, compose(S, R_nb))
+    put(R, 0, 0, 1.0, compose(R_nb.T.copy(), compose(S, R_nb)))
     return 3
 
 
@@ -307,9 +328,9 @@ def rangefinder(value: Array, x: Array, p: Array, offsets: Offsets, r: Array, H:
     predicted = height / cosine
     r[0] = value[0] - predicted
     H[0, offsets[POSITION] + 2] = -1.0 / cosine
-    tilt = -compose(R_nb, skew(np.array([0.0, 0.0, 1.0])))[2]
-    arm = -compose(R_nb, skew(lever))[2]
+    tilt = compose(R_nb, skew(np.array([0.0, 0.0, 1.0])))[2]
+    arm = compose(R_nb, skew(lever))[2]
     for j in range(3):
-        H[0, offsets[ATTITUDE] + j] = -arm[j] / cosine - predicted / cosine * tilt[j]
+        H[0, offsets[ATTITUDE] + j] = arm[j] / cosine + predicted / cosine * tilt[j]
     R[0, 0] = p[par.RANGE_SIGMA] ** 2 + (p[par.RANGE_SIGMA_PER_M] * value[0]) ** 2
     return 1
