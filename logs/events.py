@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from estimation.events import EVENT_DTYPE, Event, EventBatch, Kind, Names
 from logs.recording import Series
-from logs.topics import new_rows
+from logs.topics import new_rows, row_dtype
 
 F64 = NDArray[np.float64]
 
@@ -105,14 +105,16 @@ def events_of_series(
 ) -> EventBatch:
     """Return the events of all sensor topics among the series, in the order of their arrival.
 
-    ``positions`` orders equal arrivals (one array for each series, for example places in a file); without it
-    they keep the order of the series. Other topics are passed over.
+    ``positions`` orders equal arrivals (one array for each series, for example places in a file); without
+    it they keep the order of the series. Other topics, and series that lack their topic's columns, are
+    passed over.
     """
+    usable = [one for one in series if len(one) and fits(one)]
     names = Names()
     parts, arrivals, places = [], [], []
     reference = None
     for number, one in enumerate(series):
-        if one.topic not in KINDS or not len(one):
+        if one.topic not in KINDS or not len(one) or not fits(one):
             continue
         kind, default = KINDS[one.topic]
         rows = np.empty(len(one), dtype=EVENT_DTYPE)
@@ -122,7 +124,7 @@ def events_of_series(
         rows["sensor"], rows["clock"] = names.sensor(sensor), names.clock(one.clock)
         rows["value"] = np.nan
         rows["covariance"] = np.nan
-        _READ[kind](one, rows, series)
+        _READ[kind](one, rows, usable)
         if kind is Kind.TIMESYNC:
             reference = reference or one.strings.get("reference_clock")
         parts.append(rows)
@@ -135,6 +137,23 @@ def events_of_series(
     if reference:
         batch.timesync_reference = reference
     return batch
+
+
+def fits(series: Series) -> bool:
+    """Tell whether a series has the columns of its sensor topic (it may have more), of their shapes and
+    kinds.
+    """
+    if series.topic not in EVENT_TOPICS:
+        return False
+    expected, found = row_dtype(series.topic), series.data.dtype
+    for name in expected.names or ():
+        if name not in (found.names or ()):
+            return False
+        one, other = expected[name], found[name]
+        sizes = one.ndim == other.ndim if series.topic == "/user" else one.shape == other.shape
+        if not sizes or one.base.kind != other.base.kind:
+            return False
+    return True
 
 
 def degrees_of(radians: F64) -> F64:
@@ -235,8 +254,9 @@ def _write_velocity(rows: NDArray[np.void]) -> NDArray[np.void]:
 def _read_velocity(one: Series, rows: NDArray[np.void], everything: Sequence[Series]) -> None:
     rows["value"][:, :3] = one.data["twist_twist_linear"]
     rows["covariance"] = _unknown(one.data["twist_covariance"][:, _BLOCK][:, _UPPER])
-    if "fix_type" in one.metadata:
-        rows["value"][:, 3] = float(one.metadata["fix_type"])
+    stated = one.metadata.get("fix_type", "")
+    if stated.isdecimal():
+        rows["value"][:, 3] = float(stated)
         return
     rows["value"][:, 3] = 1.0
     partner = one.metadata.get("sensor", "gps_velocity").replace("velocity", "position")

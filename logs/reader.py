@@ -23,7 +23,7 @@ from logs.channels import ChannelInfo, LoggedMessage, channel_infos, has_columns
 from logs.columns import Raw, decode
 from logs.definition import Definition, DefinitionError, parse
 from logs.errors import LogError
-from logs.events import EVENT_TOPICS, events_of_series
+from logs.events import EVENT_TOPICS, events_of_series, fits
 from logs.recording import Recording, Series
 from logs.scan import Contents, FileBytes, scan
 from logs.store import ChunkStore
@@ -123,6 +123,9 @@ class Flight:
     def events(self) -> EventBatch:
         """Return the events of all sensor topics in the order of arrival, equal ones as in the file."""
         loaded = self._load([t for t in EVENT_TOPICS if t in self.topics])
+        for series, _ in loaded:
+            if not fits(series):
+                self._contents.report(f"{series.topic} is no sensor topic of ours: its columns are others.")
         return events_of_series([s for s, _ in loaded], [places for _, places in loaded])
 
     def recording(self) -> Recording:

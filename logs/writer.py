@@ -17,8 +17,8 @@ from typing import ParamSpec, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.events import Event
-from logs.cdr import FRAME_ID, Columns, Layout, LayoutError, layout
+from estimation.events import Event, Imu
+from logs.cdr import FRAME_ID, STAMP_NANOSEC, STAMP_SEC, Columns, Layout, LayoutError, layout
 from logs.container import INDEX_ENTRY, MESSAGE_HEADER, Container, create
 from logs.definition import parse
 from logs.encode import encode
@@ -75,6 +75,7 @@ class FlightWriter:
         self._channels: dict[tuple[object, ...], int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._layouts: dict[tuple[object, ...], Layout] = {}
+        self._imus: dict[tuple[str, str], tuple[int, NDArray[np.void]]] = {}
         self._flushed_ns: int | None = None
         if clock_offsets_ns:
             self.set_clocks(clock_offsets_ns)
@@ -153,6 +154,9 @@ class FlightWriter:
 
     def write_event(self, event: Event) -> None:
         """Write one sensor event, as its topic's message; what ``logs.events`` reads back is this event."""
+        if isinstance(event, Imu):
+            self._write_imu(event)
+            return
         for series in series_of_event(event):
             self._write_row(series)
 
@@ -259,6 +263,28 @@ class FlightWriter:
         stamp = series.stamp_ns + offset
         data = self._pack(built, stamp, series.data).tobytes()
         self._add(channel, int(series.arrival_ns[0]), int(stamp[0]), data, True)
+
+    def _write_imu(self, event: Imu) -> None:
+        """Write the sample of an IMU by changing the last one: at its rate the general way is too slow
+        onboard.
+        """
+        key = (event.sensor, event.clock)
+        if key not in self._imus:
+            (series,) = series_of_event(event)
+            self._offset(event.clock, event.stamp_ns, event.arrival_ns)
+            channel, built = self._prepare(series)
+            self._imus[key] = channel, self._pack(built, np.zeros(1, np.int64), series.data)
+        channel, message = self._imus[key]
+        stamp = event.stamp_ns + self._offsets[event.clock]
+        seconds, message[STAMP_NANOSEC] = divmod(stamp, _SECOND_NS)
+        if not -(2**31) <= seconds < 2**31:
+            raise LogError(
+                self.path, "a stamp is outside the years 1901 to 2038", "check the clock's constant"
+            )
+        message[STAMP_SEC] = seconds
+        message["angular_velocity"] = event.angular_velocity_radps
+        message["linear_acceleration"] = event.specific_force_mps2
+        self._add(channel, event.arrival_ns, stamp, message.tobytes(), True)
 
     def _block(self, series: Series) -> _Block:
         offset = self._offset(series.clock, int(series.stamp_ns[0]), int(series.arrival_ns[0]))

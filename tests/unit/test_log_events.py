@@ -75,3 +75,13 @@ def test_events_are_in_the_order_of_arrival() -> None:
     batch = events_of_series([velocities(), fixes([0, 0, 0])])
     assert batch.rows["arrival_ns"].tolist() == [105, 106, 205, 206, 305, 306]
     assert batch.sensors == ("gps_velocity", "gps_position")
+
+
+def test_series_with_other_columns_are_passed_over() -> None:
+    other = velocities()
+    other.topic = "/gps/fix"
+    damaged = velocities(fix_type="one")
+    batch = events_of_series([other, damaged])
+    assert len(batch) == 3
+    assert batch.sensors == ("gps_velocity",)
+    assert batch.rows["value"][:, 3].tolist() == [1.0, 1.0, 1.0]
