@@ -44,8 +44,10 @@ class PlaneMap:
 
     @cached_property
     def centre(self) -> tuple[Array, Array, Array]:
-        """The map in the pixels' middles: what ``at(0, 0)`` returns."""
-        return self.at(0.0, 0.0)
+        """Coordinates and derivatives in the pixels' middles, each of shape (2, pixels)."""
+        none = np.zeros((1, 1))
+        point, along_u, along_v = self.at(none, none)
+        return point[:, 0], along_u[:, 0], along_v[:, 0]
 
     @cached_property
     def step(self) -> Array:
@@ -68,16 +70,21 @@ class PlaneMap:
         along = (a if a.shape[1] == 1 else a[:, index] for a in (self.along_u, self.along_v))
         return PlaneMap(self.value[:, index], *along)
 
-    def at(self, du: float, dv: float) -> tuple[Array, Array, Array]:
-        """Return the plane's coordinates, shape (2, pixels), and their derivatives along u and v, at an
-        offset.
+    def at(self, du: Array, dv: Array) -> tuple[Array, Array, Array]:
+        """Return the plane's coordinates and their derivatives along u and v, at offsets from the pixels'
+        middles.
+
+        ``du`` and ``dv`` have shape (offsets, 1), the results (2, offsets, pixels).
         """
-        n = self.value if du == dv == 0.0 else self.value + du * self.along_u + dv * self.along_v
+        along_u, along_v = self.along_u[:, None], self.along_v[:, None]
+        n = self.value[:, None] + du * along_u + dv * along_v
         inverse = 1.0 / n[2]
         point = n[:2] * inverse
-        along_u = (self.along_u[:2] - point * self.along_u[2]) * inverse
-        along_v = (self.along_v[:2] - point * self.along_v[2]) * inverse
-        return point, along_u, along_v
+        return (
+            point,
+            (along_u[:2] - point * along_u[2]) * inverse,
+            (along_v[:2] - point * along_v[2]) * inverse,
+        )
 
 
 def disc(plane: PlaneMap, radius: float) -> Array:
@@ -98,19 +105,17 @@ def disc(plane: PlaneMap, radius: float) -> Array:
 def _disc_cut(plane: PlaneMap, radius: float, cuts: int) -> Array:
     """Return the share of each pixel inside the disc, from cuts x cuts sub-squares."""
     side = 1.0 / cuts
-    total = np.zeros(plane.value.shape[1])
-    for i in range(cuts):
-        for j in range(cuts):
-            point, along_u, along_v = plane.at((i + 0.5) * side - 0.5, (j + 0.5) * side - 0.5)
-            rho = np.maximum(np.hypot(point[0], point[1]), 1e-9 * radius)
-            slope_u = (point[0] * along_u[0] + point[1] * along_u[1]) / rho
-            slope_v = (point[0] * along_v[0] + point[1] * along_v[1]) / rho
-            slope2 = np.maximum(slope_u**2 + slope_v**2, 1e-24)
-            stretch = along_u[0] ** 2 + along_u[1] ** 2 + along_v[0] ** 2 + along_v[1] ** 2
-            slope = np.sqrt(slope2)
-            distance = (rho - radius + side * side / 24.0 * (stretch - slope2) / rho) / (slope * side)
-            total += half_plane(distance, slope_u / slope, slope_v / slope)
-    return total * (side * side)
+    middles = (np.arange(cuts) + 0.5) * side - 0.5
+    point, along_u, along_v = plane.at(np.repeat(middles, cuts)[:, None], np.tile(middles, cuts)[:, None])
+    rho = np.maximum(np.sqrt(point[0] * point[0] + point[1] * point[1]), 1e-9 * radius)
+    slope_u = (point[0] * along_u[0] + point[1] * along_u[1]) / rho
+    slope_v = (point[0] * along_v[0] + point[1] * along_v[1]) / rho
+    slope2 = np.maximum(slope_u * slope_u + slope_v * slope_v, 1e-24)
+    stretch = (along_u * along_u + along_v * along_v).sum(axis=0)
+    slope = np.sqrt(slope2)
+    distance = (rho - radius + side * side / 24.0 * (stretch - slope2) / rho) / (slope * side)
+    share: Array = half_plane(distance, slope_u / slope, slope_v / slope).mean(axis=0)
+    return share
 
 
 def square(plane: PlaneMap, side: float) -> Array:
