@@ -1,15 +1,17 @@
 """Writing a flight: MCAP, profile ``ros2``, readable by any ROS 2 tool while it is still being written.
 
-Stamps are kept: ``header.stamp`` is the source's stamp plus one constant for each clock. The constants are in
-the metadata record ``deckfix.clocks`` and each channel names its clock, so that the reader gives the raw
+Stamps are kept: ``header.stamp`` is the source's stamp plus one constant for each clock. The constants are
+in the metadata record ``deckfix.clocks`` and each channel names its clock, so that the reader gives the raw
 stamps back. Nothing here reads a clock: all times come with the messages.
+
+The file is a ROS 2 bag by itself: ``rosbags`` (``AnyReader([path])``),
+``mcap_ros2.reader.read_ros2_messages`` and Foxglove open it as it is, without a ``metadata.yaml`` beside
+it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import ParamSpec, Self, TypeVar
@@ -18,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.events import Event, Imu
+from logs.bulk import Block, merged_chunks
 from logs.cdr import FRAME_ID, STAMP_NANOSEC, STAMP_SEC, Columns, Layout, LayoutError, layout
-from logs.container import INDEX_ENTRY, MESSAGE_HEADER, Container, create
+from logs.container import Container, create
 from logs.definition import parse
 from logs.encode import encode
 from logs.errors import LogError
@@ -37,22 +40,6 @@ _INCOMPRESSIBLE = ("CompressedImage", "CompressedVideo")
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-
-@dataclass(slots=True)
-class _Block:
-    """A series ready to be packed: its channel, layout and rows in the order of arrival."""
-
-    channel: int
-    layout: Layout
-    series: Series
-    offset_ns: int
-    order: NDArray[np.intp]
-    done: int = 0
-
-    @property
-    def record_size(self) -> int:
-        return MESSAGE_HEADER.itemsize + self.layout.dtype.itemsize
 
 
 class FlightWriter:
@@ -137,20 +124,11 @@ class FlightWriter:
         if not blocks:
             return
         self._guard(self._container.flush)
-        times = np.concatenate([b.series.arrival_ns[b.order] for b in blocks])
-        owner = np.repeat(np.arange(len(blocks)), [len(b.order) for b in blocks])
-        merged = np.argsort(times, kind="stable")
-        times, owner = times[merged], owner[merged]
-        sizes = np.array([b.record_size for b in blocks], dtype=np.int64)[owner]
-        ends = np.cumsum(sizes)
-        room = max(_CHUNK_BYTES - int(sizes.max()), 1)
-        cuts = np.flatnonzero(np.diff((ends - 1) // room)) + 1
-        bounds = [0, *cuts.tolist(), len(ends)]
-        for first, last in pairwise(bounds):
-            starts = ends[first:last] - sizes[first:last]
-            self._write_chunk(
-                blocks, times[first:last], owner[first:last], starts - starts[0], int(sizes[first:last].sum())
-            )
+        try:
+            for records, entries in merged_chunks(blocks, _CHUNK_BYTES):
+                self._guard(self._container.write_chunk, records, entries)
+        except LayoutError as error:
+            raise LogError(self.path, str(error), "check the stamps and the clock's constant") from None
 
     def write_event(self, event: Event) -> None:
         """Write one sensor event, as its topic's message; what ``logs.events`` reads back is this event."""
@@ -286,7 +264,7 @@ class FlightWriter:
         message["linear_acceleration"] = event.specific_force_mps2
         self._add(channel, event.arrival_ns, stamp, message.tobytes(), True)
 
-    def _block(self, series: Series) -> _Block:
+    def _block(self, series: Series) -> Block:
         offset = self._offset(series.clock, int(series.stamp_ns[0]), int(series.arrival_ns[0]))
         if int(series.arrival_ns.min()) < 0:
             raise LogError(self.path, f"{series.topic} has arrivals before 1970", "check the log's clock")
@@ -295,7 +273,7 @@ class FlightWriter:
         channel, built = self._prepare(series)
         if built.columns and series.data.dtype.names is None:
             raise LogError(self.path, f"{series.topic} has no columns", "give it a structured array")
-        return _Block(channel, built, series, offset, np.argsort(series.arrival_ns, kind="stable"))
+        return Block(channel, built, series, offset, np.argsort(series.arrival_ns, kind="stable"))
 
     def _prepare(self, series: Series) -> tuple[int, Layout]:
         known = TOPICS.get(series.topic)
@@ -368,43 +346,6 @@ class FlightWriter:
             return encode(definition, fields)
         except LayoutError as error:
             raise LogError(self.path, str(error), "see logs.topics for the message's fields") from None
-
-    def _write_chunk(
-        self,
-        blocks: Sequence[_Block],
-        times: NDArray[np.int64],
-        owner: NDArray[np.intp],
-        starts: NDArray[np.int64],
-        size: int,
-    ) -> None:
-        """Pack the records of one chunk: each block's next rows, scattered to where the merge puts them."""
-        records = np.empty(size, dtype=np.uint8)
-        entries: dict[int, list[NDArray[np.void]]] = {}
-        for number, block in enumerate(blocks):
-            mine = np.flatnonzero(owner == number)
-            if not len(mine):
-                continue
-            rows = block.order[block.done : block.done + len(mine)]
-            stamp = block.series.stamp_ns[rows] + block.offset_ns
-            # Whole messages as bytes: assigning structures would leave out what is no field, the constants.
-            whole = f"V{block.layout.dtype.itemsize}"
-            packed = np.empty(len(mine), dtype=[("head", MESSAGE_HEADER), ("data", whole)])
-            head = packed["head"]
-            head["op"], head["length"], head["channel"] = 5, block.record_size - 9, block.channel
-            head["sequence"] = block.done + np.arange(len(mine))
-            head["log"], head["publish"] = times[mine], np.where(stamp < 0, times[mine], stamp)
-            packed["data"] = self._pack(block.layout, stamp, block.series.data[rows]).view(whole)
-            width = block.record_size
-            slots = np.ndarray((size - width + 1,), dtype=f"V{width}", buffer=records.data, strides=(1,))
-            slots[starts[mine]] = packed.view(f"V{width}")
-            index = np.empty(len(mine), dtype=INDEX_ENTRY)
-            index["log"], index["offset"] = times[mine], starts[mine]
-            entries.setdefault(block.channel, []).append(index)
-            block.done += len(mine)
-        merged = {
-            channel: np.sort(np.concatenate(parts), order="offset") for channel, parts in entries.items()
-        }
-        self._guard(self._container.write_chunk, records.tobytes(), merged)
 
     def _guard(self, call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
         try:
