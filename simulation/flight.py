@@ -30,7 +30,7 @@ from logs.sensors import Times, odometry_series
 from simulation.jets import Array
 from simulation.platform import Platform, Raft
 from simulation.sea import BEAUFORT_WIND_MPS, Sea, Wave, beaufort
-from simulation.sensors import Clock, Place, Sensors, Streams
+from simulation.sensors import Clock, Place, Sensors, SlowError, Streams
 from simulation.trajectory import Plan, Trajectory, Wind, quaternions
 
 TRUTH_RATE_HZ = 50.0
@@ -96,13 +96,14 @@ class Scenario(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=
 
 @dataclass(frozen=True, slots=True)
 class SimulatedFlight:
-    """A flight: what arrived, and what is true."""
+    """A flight: what arrived, and what is true; ``slow`` are the sensors' slow errors by the state's block."""
 
     scenario: Scenario
     seed: int
     trajectory: Trajectory
     place: Place
     batch: EventBatch
+    slow: dict[str, SlowError]
 
     @property
     def clock(self) -> Clock:
@@ -214,7 +215,8 @@ def simulate(scenario: Scenario, seed: int | None = None) -> SimulatedFlight:
     gravity = normal_gravity(float(place.origin[0]), float(place.origin[2]))
     trajectory = Trajectory(scenario.plan, blow, platform, gravity)
     sensors = Sensors(scenario.drawn, scenario.streams, scenario.clocks, place, scenario.vibration_mps2)
-    return SimulatedFlight(scenario, chosen, trajectory, place, sensors.draw(trajectory, sensing))
+    drawn = sensors.draw(trajectory, sensing)
+    return SimulatedFlight(scenario, chosen, trajectory, place, drawn.batch, drawn.slow)
 
 
 def _place(scenario: Scenario) -> Place:

@@ -8,10 +8,13 @@ rounding.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 _STEP = np.polynomial.Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])
 _STEP_JET = tuple(_STEP.deriv(k) if k else _STEP for k in range(4))
@@ -36,18 +39,39 @@ def step(t_s: Array, start_s: float, duration_s: float) -> Array:
     return np.stack([p(s) / duration_s**k for k, p in enumerate(_STEP_JET)])
 
 
-def sinusoids(t_s: Array, amplitude: Array, omega_radps: Array, phase_rad: Array) -> Array:
-    """Return the jet, shape (4, n), of the sum of A cos(w t + phi); all three of shape (m,)."""
-    out = np.empty((4, len(t_s)))
+def sinusoids(t_s: Array, omega_radps: Array, response: Complex) -> Array:
+    """Return the jets of sums of tones, Re(sum of response exp(i w t)), shape (4, n, k).
+
+    ``omega_radps`` (m,) are shared by all k sums, ``response`` (m, k) holds amplitude and phase of each
+    tone in each.
+    """
+    out = np.empty((4, len(t_s), response.shape[1]))
+    w = omega_radps[:, None]
+    cosines = [response.real, response.real, -response.real, -response.real]
+    sines = [-response.imag, -response.imag, response.imag, response.imag]
     for a in range(0, len(t_s), _CHUNK):
-        angle = np.multiply.outer(t_s[a : a + _CHUNK], omega_radps) + phase_rad
+        angle = np.multiply.outer(t_s[a : a + _CHUNK], omega_radps)
         c, s = np.cos(angle), np.sin(angle)
-        part = out[:, a : a + _CHUNK]
-        part[0] = c @ amplitude
-        part[1] = -s @ (amplitude * omega_radps)
-        part[2] = -c @ (amplitude * omega_radps**2)
-        part[3] = s @ (amplitude * omega_radps**3)
+        for k in range(4):
+            # Every derivative turns the phase by a quarter: cos -> -sin -> -cos -> sin.
+            even, odd = (c, s) if k % 2 == 0 else (-s, c)
+            out[k, a : a + _CHUNK] = even @ (cosines[k] * w**k) + odd @ (sines[k] * w**k)
     return out
+
+
+@dataclass(frozen=True, slots=True)
+class Tones:
+    """Sums of tones on three axes: amplitude, angular frequency [rad/s] and phase [rad], each (3, m)."""
+
+    amplitude: Array
+    omega_radps: Array
+    phase_rad: Array
+
+    def motion(self, t_s: Array) -> Array:
+        """Return their jet, shape (4, n, 3)."""
+        response = self.amplitude * np.exp(1j * self.phase_rad)
+        axes = [sinusoids(t_s, w, r[:, None]) for w, r in zip(self.omega_radps, response, strict=True)]
+        return np.concatenate(axes, axis=2)
 
 
 def product(a: Array, b: Array) -> Array:

@@ -11,12 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from simulation.jets import Array, constant, sinusoids
+from simulation.jets import Array, Complex, Tones, constant, sinusoids
 from simulation.sea import GRAVITY_MPS2, Sea
-
-Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,41 +67,36 @@ class PlatformMotion:
 
 @dataclass(frozen=True, slots=True)
 class Platform:
-    """A raft in a sea. ``drift`` are amplitude (2, m), angular frequency (2, m) and phase (2, m) of its
-    slow drift.
-    """
+    """A raft in a sea; ``drift`` is its slow motion on the anchor line, in the first two axes."""
 
     raft: Raft
     sea: Sea
-    drift: tuple[Array, Array, Array] = field(repr=False)
+    drift: Tones = field(repr=False)
 
     @classmethod
     def draw(cls, raft: Raft, sea: Sea, rng: np.random.Generator, tones: int = 4) -> Platform:
         """Draw the slow drift on the anchor line; it never leaves the circle."""
         share = rng.dirichlet(np.ones(tones), size=2)
-        # The two axes' largest values, sqrt(2) apart from the circle, are never exceeded.
-        amplitude = share * raft.circle_m / np.sqrt(2.0)
-        omega = 2.0 * np.pi / (raft.drift_period_s * rng.uniform(0.7, 2.0, size=(2, tones)))
-        return cls(raft, sea, (amplitude, omega, 2.0 * np.pi * rng.random((2, tones))))
+        # Neither axis ever exceeds the circle over the square root of two.
+        amplitude = np.vstack([share * raft.circle_m / np.sqrt(2.0), np.zeros((1, tones))])
+        omega = 2.0 * np.pi / (raft.drift_period_s * rng.uniform(0.7, 2.0, size=(3, tones)))
+        return cls(raft, sea, Tones(amplitude, omega, 2.0 * np.pi * rng.random((3, tones))))
 
     def motion(self, t_s: Array) -> PlatformMotion:
         """Return the deck's motion at the times t_s (n,)."""
         sea, raft = self.sea, self.raft
+        waves = sea.amplitude_m * np.exp(1j * sea.phase_rad)
+        heave = raft.heave_rao(sea.omega_radps) * waves
+        # Deep water: the orbital motion along the waves' direction is a quarter period behind the elevation, and as
+        # large; the slope is as late, and k = w^2 / g times as large.
+        sway = -1j * heave
+        slope = -1j * raft.tilt_rao(sea.omega_radps) * waves * sea.omega_radps**2 / GRAVITY_MPS2
         north, east = np.cos(sea.direction_rad), np.sin(sea.direction_rad)
-        heave = raft.heave_rao(sea.omega_radps) * sea.amplitude_m
-        # Deep water: the orbital motion along the waves' direction is a quarter period behind the elevation.
-        surge = raft.heave_rao(sea.omega_radps) * sea.amplitude_m * -1.0j
-        slope = raft.tilt_rao(sea.omega_radps) * sea.amplitude_m * sea.omega_radps**2 / GRAVITY_MPS2 * -1.0j
-        position = constant(t_s, (0.0, 0.0, -raft.freeboard_m))
+        both = np.stack([sway * north, sway * east, -heave, slope * north, slope * east], axis=1)
+        moved = sinusoids(t_s, sea.omega_radps, both)
+        position = constant(t_s, (0.0, 0.0, -raft.freeboard_m)) + moved[:, :, :3]
+        # A deck that rises towards north has a downward normal that leans north.
         normal = constant(t_s, (0.0, 0.0, 1.0))
-        position[:, :, 2] -= self._tones(t_s, heave)
-        for axis, along in enumerate((north, east)):
-            position[:, :, axis] += self._tones(t_s, surge * along)
-            position[:, :, axis] += sinusoids(t_s, *(column[axis] for column in self.drift))
-            # A deck that rises towards north has a downward normal that leans north.
-            normal[:, :, axis] += self._tones(t_s, slope * along)
+        normal[:, :, :2] += moved[:, :, 3:]
+        position[:, :, :2] += self.drift.motion(t_s)[:, :, :2]
         return PlatformMotion(position, normal)
-
-    def _tones(self, t_s: Array, response: Complex) -> Array:
-        """Return the jet of the sea's components, each times its complex response."""
-        return sinusoids(t_s, np.abs(response), self.sea.omega_radps, self.sea.phase_rad + np.angle(response))

@@ -99,6 +99,26 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
+class SlowError:
+    """A slow error at the true times of its sensor's samples: ``t_s`` (n,), ``values`` (n, k)."""
+
+    t_s: Array
+    values: Array
+
+    def at(self, t_s: Array) -> Array:
+        """Return the error at other times, interpolated, shape (m, k)."""
+        return np.stack([np.interp(t_s, self.t_s, column) for column in self.values.T], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What sensors gave: their events in the order of arrival, and the true slow errors by the state's block."""
+
+    batch: EventBatch
+    slow: dict[str, SlowError]
+
+
+@dataclass(frozen=True, slots=True)
 class Sensors:
     """All sensors of a vehicle. ``config`` describes their errors, ``streams`` their messages, ``clocks``
     what these are stamped with. ``vibration_mps2`` is a white scatter of the specific force in flight which
@@ -111,17 +131,18 @@ class Sensors:
     place: Place
     vibration_mps2: float = 0.0
 
-    def draw(self, trajectory: Trajectory, rng: np.random.Generator) -> EventBatch:
-        """Return everything that arrives during a flight, in the order of arrival.
+    def draw(self, trajectory: Trajectory, rng: np.random.Generator) -> Drawn:
+        """Return everything that arrives during a flight, and the slow errors that were drawn.
 
         Each sensor draws from a generator of its own, so that switching one on or off changes no other.
         """
         generators = iter(rng.spawn(7))
         c, s = self.config, self.streams
+        slow: dict[str, SlowError] = {}
         parts = [
-            self._imu(trajectory, s.imu, next(generators)),
-            self._gps(trajectory, s.gps, next(generators)),
-            self._barometer(trajectory, s.barometer, next(generators)),
+            self._imu(trajectory, s.imu, next(generators), slow),
+            self._gps(trajectory, s.gps, next(generators), slow),
+            self._barometer(trajectory, s.barometer, next(generators), slow),
             self._magnetometer(trajectory, s.magnetometer, next(generators)),
             self._attitude(trajectory, s.attitude, next(generators)),
             self._rangefinder(trajectory, s.rangefinder, next(generators)),
@@ -130,41 +151,47 @@ class Sensors:
         batches = [p for p, on in zip(parts, used, strict=True) if on]
         if s.timesync is not None:
             batches.append(self._timesync(trajectory, s.timesync, next(generators)))
-        return EventBatch.concatenate(batches)
+        return Drawn(EventBatch.concatenate(batches), slow)
 
-    def _imu(self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator) -> EventBatch:
+    def _imu(
+        self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator, slow: dict[str, SlowError]
+    ) -> EventBatch:
         c = self.config.imu
         t = _times(stream, trajectory.plan.duration_s)
         dt = 1.0 / stream.rate_hz
         m = trajectory.motion(t)
         n = len(t)
         rate, force = m.angular_velocity_radps.copy(), m.specific_force_mps2.copy()
-        for values, sigma, walk, noise in (
-            (rate, c.gyro_bias_sigma, c.gyro_bias_walk, c.gyro_noise),
-            (force, c.accel_bias_sigma, c.accel_bias_walk, c.accel_noise),
+        for name, values, sigma, walk, noise in (
+            ("gyro_bias", rate, c.gyro_bias_sigma, c.gyro_bias_walk, c.gyro_noise),
+            ("accel_bias", force, c.accel_bias_sigma, c.accel_bias_walk, c.accel_noise),
         ):
             steps = walk * math.sqrt(dt) * rng.standard_normal((n, 3))
             steps[0] = sigma * rng.standard_normal(3)
-            values += np.cumsum(steps, axis=0) + noise / math.sqrt(dt) * rng.standard_normal((n, 3))
+            slow[name] = SlowError(t, np.cumsum(steps, axis=0))
+            values += slow[name].values + noise / math.sqrt(dt) * rng.standard_normal((n, 3))
         shake = self.vibration_mps2 * rng.standard_normal((n, 3))
         flying = (t > trajectory.plan.rest_s) & (t < trajectory.plan.touchdown_s)
         force += np.where(flying[:, None], shake, 0.0)
         value = np.hstack([rate, force])
         return self._batch("imu", Kind.IMU, t, value, None, c.latency_s or 0.0, stream, rng)
 
-    def _gps(self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator) -> EventBatch:
+    def _gps(
+        self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator, slow: dict[str, SlowError]
+    ) -> EventBatch:
         c = self.config.gps
         t = _times(stream, trajectory.plan.duration_s)
         n = len(t)
         m = trajectory.motion(t)
         lever = np.array(c.lever_arm_m)
         sigma = np.array([c.position_sigma_m, c.position_sigma_m, c.height_sigma_m])
-        slow = np.zeros(3)
+        wander = np.zeros(3)
         position = m.position_m + m.R_nb @ lever + sigma * rng.standard_normal((n, 3))
         if c.bias:
-            slow = np.array([c.bias_sigma_m, c.bias_sigma_m, c.height_bias_sigma_m])
+            wander = np.array([c.bias_sigma_m, c.bias_sigma_m, c.height_bias_sigma_m])
             time = np.array([c.bias_time_s, c.bias_time_s, c.height_bias_time_s])
-            position += gauss_markov(n, 1.0 / stream.rate_hz, slow, time, rng)
+            slow["gps_bias"] = SlowError(t, gauss_markov(n, 1.0 / stream.rate_hz, wander, time, rng))
+            position += slow["gps_bias"].values
         place = np.array([ned_to_geodetic(p, self.place.origin) for p in position]).reshape(-1, 3)
         swing = np.cross(m.angular_velocity_radps, lever)
         speed_sigma = np.array([c.velocity_sigma_mps, c.velocity_sigma_mps, c.climb_sigma_mps])
@@ -174,7 +201,7 @@ class Sensors:
         # One message carries both: they share stamp, way and loss.
         seed = rng.integers(1 << 62)
         both = (
-            ("gps_position", Kind.GPS_POSITION, place, sigma**2 + slow**2),
+            ("gps_position", Kind.GPS_POSITION, place, sigma**2 + wander**2),
             ("gps_velocity", Kind.GPS_VELOCITY, velocity, speed_sigma**2),
         )
         batches = []
@@ -184,13 +211,16 @@ class Sensors:
             batches.append(self._batch(name, kind, t, values, variance, c.latency_s, stream, again))
         return EventBatch.concatenate(batches)
 
-    def _barometer(self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator) -> EventBatch:
+    def _barometer(
+        self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator, slow: dict[str, SlowError]
+    ) -> EventBatch:
         c = self.config.barometer
         t = _times(stream, trajectory.plan.duration_s)
         steps = c.bias_walk / math.sqrt(stream.rate_hz) * rng.standard_normal(len(t))
         steps[0] = c.bias_sigma_m * rng.standard_normal()
         height = -trajectory.motion(t).position_m[:, 2] + self.place.origin[2]
-        height += np.cumsum(steps) + c.sigma_m * rng.standard_normal(len(t))
+        slow["baro_bias"] = SlowError(t, np.cumsum(steps)[:, None])
+        height += slow["baro_bias"].values[:, 0] + c.sigma_m * rng.standard_normal(len(t))
         value = np.stack([standard_pressure(height), np.full(len(t), 288.15)], axis=1)
         return self._batch("barometer", Kind.BAROMETER, t, value, None, c.latency_s, stream, rng)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from simulation.jets import Array, constant, product, sinusoids, step
+from simulation.jets import Array, Tones, constant, product, step
 from simulation.platform import Platform
 
 PHASES = ("rest", "climb", "cruise", "hover", "descent", "deck")
@@ -79,20 +79,17 @@ class Plan:
         return self.bounds_s["descent"][1]
 
 
-def _no_tones() -> tuple[Array, Array, Array]:
-    return np.zeros((3, 0)), np.zeros((3, 0)), np.zeros((3, 0))
+def _none() -> Tones:
+    return Tones(np.zeros((3, 0)), np.zeros((3, 0)), np.zeros((3, 0)))
 
 
 @dataclass(frozen=True, slots=True)
 class Wind:
-    """Mean wind and gusts, NED [m/s], and the sway that they cause in the vehicle's place [m], as tones.
-
-    ``gust`` and ``sway`` are amplitude, angular frequency and phase, each (3, m).
-    """
+    """Mean wind and gusts, NED [m/s], and the sway that they cause in the vehicle's place [m]."""
 
     mean_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    gust: tuple[Array, Array, Array] = field(default_factory=_no_tones)
-    sway: tuple[Array, Array, Array] = field(default_factory=_no_tones)
+    gust: Tones = field(default_factory=_none)
+    sway: Tones = field(default_factory=_none)
 
     @classmethod
     def draw(
@@ -103,17 +100,17 @@ class Wind:
         """
         mean = (float(speed_mps * np.cos(direction_rad)), float(speed_mps * np.sin(direction_rad)), 0.0)
         axes = np.array([1.0, 1.0, 0.3])
-        return cls(mean, _tones(0.15 * speed_mps * axes, rng, tones), _tones(sway_m * axes, rng, tones))
+        return cls(
+            mean, _draw_tones(0.15 * speed_mps * axes, rng, tones), _draw_tones(sway_m * axes, rng, tones)
+        )
 
 
-def _tones(sigma: Array, rng: np.random.Generator, tones: int) -> tuple[Array, Array, Array]:
-    """Draw tones from 0.08 to 0.6 Hz whose sum has these standard deviations (3,), less where they are
-    fast.
-    """
+def _draw_tones(sigma: Array, rng: np.random.Generator, tones: int) -> Tones:
+    """Draw tones from 0.08 to 0.6 Hz whose sum has these standard deviations (3,); slow ones are the larger."""
     omega = 2.0 * np.pi * np.exp(rng.uniform(np.log(0.08), np.log(0.6), size=(3, tones)))
     weight = rng.uniform(0.5, 1.0, size=(3, tones)) / omega
     amplitude = np.sqrt(2.0) * sigma[:, None] * weight / np.linalg.norm(weight, axis=1, keepdims=True)
-    return amplitude, omega, rng.uniform(0.0, 2.0 * np.pi, size=(3, tones))
+    return Tones(amplitude, omega, rng.uniform(0.0, 2.0 * np.pi, size=(3, tones)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +158,8 @@ class Trajectory:
         airborne = product(step(t_s, climb[0], 0.5 * plan.climb_s), constant(t_s, 1.0) - ride)
         mean_deck = constant(t_s, (0.0, 0.0, -self.platform.raft.freeboard_m))
         position = self._path(t_s)
-        position += product(airborne, _vector(t_s, self.wind.sway)) + product(ride, deck.position - mean_deck)
-        relative_wind = constant(t_s, self.wind.mean_mps) + _vector(t_s, self.wind.gust)
+        position += product(airborne, self.wind.sway.motion(t_s)) + product(ride, deck.position - mean_deck)
+        relative_wind = constant(t_s, self.wind.mean_mps) + self.wind.gust.motion(t_s)
         force = position[2] - [0.0, 0.0, self.gravity_mps2]
         force_rate = position[3]
         # Thrust = specific force + drag; on the deck what stands for it is the deck's upward normal.
@@ -232,10 +229,6 @@ def quaternions(matrices: Array) -> Array:
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     signed: Array = np.where(q[:, :1] < 0.0, -q, q)
     return signed
-
-
-def _vector(t_s: Array, tones: tuple[Array, Array, Array]) -> Array:
-    return np.stack([sinusoids(t_s, *(column[axis] for column in tones)) for axis in range(3)], axis=2)
 
 
 def _attitude(up: Array, up_rate: Array, yaw: Array, yaw_rate: Array) -> tuple[Array, Array]:
