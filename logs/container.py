@@ -114,6 +114,7 @@ class Container:
         ).compress
         self._emit(MAGIC)
         self._emit_record(Header(profile=profile, library=library))
+        stream.flush()  # from here on the file is an MCAP file, whatever happens
 
     @property
     def message_count(self) -> int:

@@ -11,6 +11,7 @@ it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -211,9 +212,14 @@ class FlightWriter:
         """Write an attachment."""
         self._guard(self._container.add_attachment, name, media_type, data)
 
-    def flush(self) -> None:
-        """Write what is held back, so that it survives the process."""
+    def flush(self, *, sync: bool = False) -> None:
+        """Write what is held back, so that it survives the process, and with ``sync`` the loss of power.
+
+        Messages flush by themselves as later ones arrive; call this when a recording falls silent.
+        """
         self._guard(self._container.flush)
+        if sync:
+            self._guard(os.fsync, self._file.fileno())
         self._flushed_ns = None
 
     def close(self) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import random
 import sys
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +252,48 @@ def test_messages_that_do_not_fit_are_refused(tmp_path: Path) -> None:
                 writer.write_message(topic, message, arrival_ns=UTC)
         with pytest.raises(LogError, match="before 1970"):
             writer.write_message("/log", {}, arrival_ns=-1)
+
+
+def test_an_error_within_leaves_a_complete_file(tmp_path: Path) -> None:
+    def record() -> None:
+        with FlightWriter(tmp_path / "f.mcap") as writer:
+            writer.write_message("/log", {"msg": "a"}, arrival_ns=UTC)
+            raise RuntimeError("the camera fell off")
+
+    with pytest.raises(RuntimeError, match="fell off"):
+        record()
+    opened = open_flight(tmp_path / "f.mcap")
+    assert opened.complete
+    assert [m.decoded.msg for m in opened.messages()] == ["a"]
+
+
+def test_a_silent_recording_is_readable_after_flush(tmp_path: Path) -> None:
+    writer = FlightWriter(tmp_path / "f.mcap")
+    writer.write_message("/log", {"msg": "a"}, arrival_ns=UTC)
+    assert list(open_flight(tmp_path / "f.mcap").messages()) == []
+    writer.flush(sync=True)
+    assert open_flight(tmp_path / "f.mcap").channels[0].count == 1
+    writer.close()
+    writer.close()
+
+
+def test_images_stream_in_bounded_memory(tmp_path: Path) -> None:
+    path, size, count = tmp_path / "f.mcap", 200_000, 150
+    content = random.Random(0).randbytes(size)
+    with FlightWriter(path) as writer:
+        for i in range(count):
+            writer.write_message(
+                "/camera/image/compressed", {"format": "jpeg", "data": content}, arrival_ns=UTC + i * 10**7
+            )
+    opened = open_flight(path)
+    tracemalloc.start()
+    try:
+        total = sum(len(m.decoded.data) for m in opened.messages())
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert total == size * count
+    assert peak < 0.3 * total
 
 
 def test_series_of_zero_length_are_passed_over(tmp_path: Path) -> None:
