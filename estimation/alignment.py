@@ -60,6 +60,10 @@ HEADING_MEMORY_S = 60.0
 """Memory of the heading from accelerations."""
 DIFFERENCE_NS = 1_000_000_000
 """Spacing of the fixes whose difference stands for a velocity that the receiver does not give."""
+DERIVED_SIGMA_MPS = 1.0
+"""1-sigma of a velocity from the difference of two fixes: half an interval old, under unknown acceleration."""
+PATIENCE_NS = 3_000_000_000
+"""How long a start waits for a barometer after the first fix."""
 TRY_NS = 100_000_000
 """Spacing of the attempts to start."""
 FRESH_NS = 1_200_000_000
@@ -92,6 +96,8 @@ class Aligner:
     _velocities: list[tuple[int, Array, Array]] = field(default_factory=list)
     _fix: tuple[int, Array, Array] | None = None
     _earlier_fix: tuple[int, Array, Array] | None = None
+    _first_fix_ns: int = 0
+    _velocity_derived: bool = False
     _mag: tuple[int, Array] | None = None
     _attitude: tuple[int, Array] | None = None
     _pressure: tuple[int, float] | None = None
@@ -120,6 +126,7 @@ class Aligner:
                 self._take_fix(t, value[:3], rows.own[i].copy())
             elif kind == Kind.GPS_VELOCITY and value[3] >= 1.0:
                 self._take_velocity(t, value[:3], rows.own[i].copy())
+                self._velocity_derived = False
             elif kind == Kind.MAGNETOMETER and self.config.magnetometer.use:
                 self._mag = (t, value[:3])
             elif kind == Kind.ATTITUDE and self.config.attitude.use != "off":
@@ -132,11 +139,13 @@ class Aligner:
         """Keep a fix; where the receiver gives no velocity for a while, fixes make one."""
         if self._earlier_fix is None:
             self._earlier_fix = (t, fix, own)
+            self._first_fix_ns = t
         t0, earlier, _ = self._earlier_fix
         if t - t0 >= DIFFERENCE_NS:
-            if not self._velocities or t - self._velocities[-1][0] > DIFFERENCE_NS:
+            if not self._velocities or t - self._velocities[-1][0] >= DIFFERENCE_NS:
                 moved = geodetic_to_ned(fix[0], fix[1], fix[2], earlier)
                 self._take_velocity(t, moved / ((t - t0) * 1e-9), np.full(6, np.nan))
+                self._velocity_derived = True
             self._earlier_fix = (t, fix, own)
         self._fix = (t, fix, own)
 
@@ -242,8 +251,8 @@ class Aligner:
             return None
         if t - self._fix[0] > FRESH_NS or t - self._velocities[-1][0] > FRESH_NS:
             return None
-        if c.barometer.use and self._pressure is None and len(self._velocities) < 20:
-            return None  # give a slow barometer a few seconds to speak
+        if c.barometer.use and self._pressure is None and t - self._first_fix_ns < PATIENCE_NS:
+            return None
         window = self._window()
         rest = self._still(window)
         velocity = self._velocities[-1][1]
@@ -340,7 +349,8 @@ class Aligner:
         floor = np.array([g.position_sigma_m, g.position_sigma_m, g.height_sigma_m]) ** 2
         white = np.maximum(floor, stated * (g.white_fraction**2 if g.bias else 1.0))
         put(POSITION, white)
-        put(VELOCITY, np.array([g.velocity_sigma_mps, g.velocity_sigma_mps, g.climb_sigma_mps]) ** 2 * 4.0)
+        speed = 4.0 * np.array([g.velocity_sigma_mps, g.velocity_sigma_mps, g.climb_sigma_mps]) ** 2
+        put(VELOCITY, speed + DERIVED_SIGMA_MPS**2 if self._velocity_derived and not rest else speed)
         tilt = c.initialisation.tilt_sigma_rad if rest else c.initialisation.flight_tilt_sigma_rad
         R = quat_to_matrix(q)
         a = int(o[ATTITUDE])

@@ -229,6 +229,7 @@ class LandingEstimator:
         if self._engine is None:
             self._not_ready(h.size)
             return
+        self._advance()
         self._settle(h.settle(everything=True))
         rest = h.rows.take(np.arange(h.size))
         rest.outcome[:] = Outcome.REJECTED_FUTURE
