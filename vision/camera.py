@@ -24,6 +24,8 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vision.lens import distort, undistort
+
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
@@ -141,7 +143,7 @@ class Camera:
             x, y = np.broadcast_arrays(x, y)
             return x.copy(), y.copy()
         x, y = np.broadcast_arrays(x, y)
-        return _undistort(x, y, self.distortion)
+        return undistort(x, y, self.distortion)
 
     def project(self, points_m: ArrayLike) -> tuple[Array, Array]:
         """Return the pixel (u, v) of points in the camera frame, shape (..., 3); NaN behind the camera (Z <=
@@ -153,7 +155,7 @@ class Camera:
         z = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
         x, y = p[..., 0] / z, p[..., 1] / z
         if self.distortion:
-            x, y = _distort(x, y, self.distortion)
+            x, y = distort(x, y, self.distortion)
         return self.fx * x + self.centre[0], self.fy * y + self.centre[1]
 
     @cached_property
@@ -331,48 +333,6 @@ def _number(name: str, value: Any) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{name}: {value!r} is not finite")
     return number
-
-
-def _coefficients(distortion: tuple[float, ...]) -> tuple[float, ...]:
-    """Return (k1, k2, p1, p2, k3, k4, k5, k6), missing ones zero."""
-    return distortion + (0.0,) * (8 - len(distortion))
-
-
-def _distort(x: Array, y: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Apply OpenCV's lens model to rays."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(distortion)
-    s = x * x + y * y
-    radial = (1.0 + s * (k1 + s * (k2 + s * k3))) / (1.0 + s * (k4 + s * (k5 + s * k6)))
-    return (
-        x * radial + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
-        y * radial + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y,
-    )
-
-
-def _undistort(xd: Array, yd: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Invert the lens model by Newton's method; NaN where it does not converge (no ray has that image)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(distortion)
-    x, y = xd.astype(np.float64), yd.astype(np.float64)
-    with np.errstate(all="ignore"):
-        for _ in range(25):
-            s = x * x + y * y
-            over, under = 1.0 + s * (k1 + s * (k2 + s * k3)), 1.0 + s * (k4 + s * (k5 + s * k6))
-            radial = over / under
-            slope = (
-                k1 + s * (2.0 * k2 + s * 3.0 * k3) - radial * (k4 + s * (2.0 * k5 + s * 3.0 * k6))
-            ) / under
-            ex, ey = _distort(x, y, distortion)
-            ex, ey = ex - xd, ey - yd
-            a = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-            b = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-            d = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
-            det = a * d - b * b
-            x, y = x - (d * ex - b * ey) / det, y - (a * ey - b * ex) / det
-            if np.nanmax(np.abs(ex) + np.abs(ey), initial=0.0) < 1e-13:
-                break
-        ex, ey = _distort(x, y, distortion)
-        bad = ~(np.abs(ex - xd) + np.abs(ey - yd) < 1e-9)
-    return np.where(bad, np.nan, x), np.where(bad, np.nan, y)
 
 
 def _raspberry_pi_v2(width: int, height: int, columns: int, rows_read: int) -> Camera:
