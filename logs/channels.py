@@ -9,9 +9,9 @@ from types import MappingProxyType
 from typing import Any
 
 from estimation.events import AUTOPILOT
+from logs.contents import Contents
 from logs.errors import LogError
 from logs.events import FOREIGN
-from logs.scan import Contents
 from logs.store import ChunkStore
 from logs.topics import TOPICS
 

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from estimation.events import EventBatch
 from logs.channels import ChannelInfo, LoggedMessage, channel_infos, has_columns, series_metadata
 from logs.columns import Raw, decode
+from logs.contents import Contents, FileBytes
 from logs.definition import Definition, DefinitionError, parse
 from logs.errors import LogError
 from logs.events import EVENT_TOPICS, events_of_series, fits
 from logs.recording import Recording, Series
-from logs.scan import Contents, FileBytes, scan
+from logs.scan import scan
 from logs.store import ChunkStore
 from logs.writer import CLOCKS, PROBLEMS
 

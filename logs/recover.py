@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from logs.chunks import ChunkError, ChunkRef, decompress, index_by_walking
 from logs.container import Container, create
+from logs.contents import Contents, FileBytes
 from logs.errors import LogError
-from logs.scan import Contents, FileBytes, scan
+from logs.scan import scan
 
 RECOVERED = "deckfix.recovered"
 _MESSAGE = struct.Struct("<BQHIQQ")

@@ -6,99 +6,21 @@ Only a file that is no MCAP at all is refused.
 
 from __future__ import annotations
 
-import mmap
 import struct
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from io import BytesIO
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    Footer,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
-from numpy.typing import NDArray
+from mcap.records import Channel, Header, Metadata, Schema
 
-from logs.chunks import ChunkError, ChunkRef, decompress, walk
+from logs.chunks import ChunkError, decompress, walk
 from logs.container import INDEX_ENTRY, MAGIC
+from logs.contents import PARSE_ERRORS, Contents, FileBytes, add_attachment, chunk_at, parse
 from logs.errors import LogError
+from logs.summary import from_summary
 
-PARSE_ERRORS = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, MemoryError)
-"""What parsing a damaged record may raise."""
-
-_CHUNK_HEAD = struct.Struct("<QQQII")
-_FOOTER_BYTES = 9 + 20 + 8
-_COMPRESSIONS = {b"": "", b"lz4": "lz4", b"zstd": "zstd"}
-_MOST_PROBLEMS = 20
 _LARGEST_OPCODE = 0x0F
-
-R = TypeVar("R")
-
-
-@dataclass(slots=True)
-class Contents:
-    """What was found in a file; ``loose`` are the messages outside of chunks, as message indexes of the
-    file."""
-
-    profile: str = ""
-    library: str = ""
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[ChunkRef] = field(default_factory=list)
-    loose: dict[int, NDArray[np.void]] = field(default_factory=dict)
-    counts: dict[int, int] | None = None
-    metadata: list[Metadata] = field(default_factory=list)
-    attachments: list[Attachment] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    complete: bool = True
-    lost_bytes: int = 0
-    damaged_at: int | None = None
-
-    def report(self, problem: str) -> None:
-        """Note a problem, unless there are many already."""
-        if len(self.problems) < _MOST_PROBLEMS and problem not in self.problems:
-            self.problems.append(problem)
-
-    def damage(self, offset: int, size: int) -> None:
-        """Count bytes that could not be read."""
-        self.complete = False
-        self.lost_bytes += size
-        self.damaged_at = offset if self.damaged_at is None else min(self.damaged_at, offset)
-
-
-class FileBytes:
-    """A file mapped into memory, read-only; slices are copies only where asked for."""
-
-    def __init__(self, path: Path) -> None:
-        try:
-            with path.open("rb") as stream:
-                size = stream.seek(0, 2)
-                if size == 0:
-                    raise LogError(path, "the file is empty", "record or import it again")
-                self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        except FileNotFoundError:
-            raise LogError(path, "no such file", "check the name") from None
-        except (OSError, ValueError) as error:
-            raise LogError(path, f"cannot be read ({error})", "check that it is a readable file") from None
-        self.view = memoryview(self._map)
-        self.size = size
-
-    def find(self, pattern: bytes, start: int) -> int:
-        """Return the first place of a pattern, -1 if there is none."""
-        return self._map.find(pattern, start)
 
 
 def scan(path: Path, data: FileBytes) -> Contents:
@@ -112,7 +34,7 @@ def scan(path: Path, data: FileBytes) -> Contents:
             raise LogError(path, "the file ends within its first bytes", "nothing can be recovered from it")
         raise LogError(path, "not an MCAP file", "import other logs with 'deckfix import'")
     problems: list[str] = []
-    summary = _from_summary(data, problems)
+    summary = from_summary(data, problems)
     if summary is not None:
         return summary
     found = _Linear(data).run()
@@ -120,144 +42,6 @@ def scan(path: Path, data: FileBytes) -> Contents:
         found.report(problem)
         found.complete = False
     return found
-
-
-def _parse(read: Callable[[ReadDataStream], R], content: memoryview) -> R:
-    return read(ReadDataStream(BytesIO(content)))
-
-
-def _from_summary(data: FileBytes, problems: list[str]) -> Contents | None:
-    """Read the summary, or return None where it is missing, does not tell everything, or is damaged (a
-    problem).
-    """
-    damaged = "The end of the file is damaged; it was read record by record."
-    if data.size < 8 + _FOOTER_BYTES or bytes(data.view[-8:]) != MAGIC:
-        return None  # said by whoever reads on
-    footer_at = data.size - _FOOTER_BYTES
-    opcode, length = struct.unpack_from("<BQ", data.view, footer_at)
-    if opcode != 2 or length != 20:
-        problems.append(damaged)
-        return None
-    footer = _parse(Footer.read, data.view[footer_at + 9 : footer_at + 29])
-    start = footer.summary_start
-    if start == 0:
-        return None
-    if start > footer_at:
-        problems.append(damaged)
-        return None
-    if footer.summary_crc and zlib.crc32(data.view[start : footer_at + 25]) != footer.summary_crc:
-        problems.append(damaged)
-        return None
-    try:
-        return _read_summary(data, start, footer_at)
-    except PARSE_ERRORS:
-        problems.append(damaged)
-        return None
-
-
-def _read_summary(data: FileBytes, start: int, end: int) -> Contents | None:
-    found = Contents()
-    statistics: Statistics | None = None
-    attachments, metadata = [], []
-    opcode, length = struct.unpack_from("<BQ", data.view, 8)
-    if opcode != 1 or length > data.size - 17:
-        return None
-    header = _parse(Header.read, data.view[17 : 17 + length])
-    found.profile, found.library = header.profile, header.library
-    section = data.view[start:end]
-    for opcode, at, length in walk(section):
-        content = section[at : at + length]
-        if opcode == 3:
-            schema = _parse(Schema.read, content)
-            found.schemas[schema.id] = schema
-        elif opcode == 4:
-            channel = _parse(Channel.read, content)
-            found.channels[channel.id] = channel
-        elif opcode == 8:
-            found.chunks.append(_chunk_of_index(data, _parse(ChunkIndex.read, content)))
-        elif opcode == 10:
-            attachments.append(_parse(AttachmentIndex.read, content))
-        elif opcode == 13:
-            metadata.append(_parse(MetadataIndex.read, content))
-        elif opcode == 11:
-            statistics = _parse(Statistics.read, content)
-    if statistics is None or not _complete(found, statistics, len(attachments), len(metadata)):
-        return None
-    found.counts = dict(statistics.channel_message_counts)
-    found.chunks.sort(key=lambda c: c.offset)
-    for entry in attachments:
-        _add_attachment(found, _record(data, entry.offset, 9))
-    for item in metadata:
-        found.metadata.append(_parse(Metadata.read, _record(data, item.offset, 12)))
-    return found
-
-
-def _complete(found: Contents, statistics: Statistics, attachments: int, metadata: int) -> bool:
-    """Tell whether the summary indexes everything that its statistics count."""
-    return (
-        statistics.chunk_count == len(found.chunks)
-        and statistics.channel_count == len(found.channels)
-        and statistics.attachment_count == attachments
-        and statistics.metadata_count == metadata
-        and sum(statistics.channel_message_counts.values()) == statistics.message_count
-        and (statistics.message_count == 0 or bool(found.chunks))
-        and all(c.schema_id == 0 or c.schema_id in found.schemas for c in found.channels.values())
-        and all(chunk.indexes for chunk in found.chunks)
-    )
-
-
-def _record(data: FileBytes, offset: int, opcode: int) -> memoryview:
-    """Return the content of the record at an offset.
-
-    Raises:
-        ValueError: another record, or none, stands there.
-    """
-    if offset + 9 > data.size:
-        raise ValueError("a record outside of the file")
-    found, length = struct.unpack_from("<BQ", data.view, offset)
-    if found != opcode or length > data.size - offset - 9:
-        raise ValueError("not the record that the index promises")
-    return data.view[offset + 9 : offset + 9 + length]
-
-
-def _chunk_of_index(data: FileBytes, index: ChunkIndex) -> ChunkRef:
-    chunk = _chunk(_record(data, index.chunk_start_offset, 6), index.chunk_start_offset)
-    return replace(
-        chunk,
-        first_ns=index.message_start_time,
-        last_ns=index.message_end_time,
-        indexes=dict(index.message_index_offsets),
-    )
-
-
-def _chunk(content: memoryview, offset: int, truncated: bool = False) -> ChunkRef:
-    """Parse the head of a chunk record; ``content`` may end early where the chunk is truncated."""
-    first, last, size, crc, length = _CHUNK_HEAD.unpack_from(content)
-    name = bytes(content[32 : 32 + length]) if length <= 8 else b"?"
-    if name not in _COMPRESSIONS:
-        raise ValueError("a chunk of unknown compression")
-    (stored,) = struct.unpack_from("<Q", content, 32 + length)
-    start = 40 + length
-    if stored > len(content) - start:
-        if not truncated:
-            raise ValueError("a chunk longer than its record")
-        stored = len(content) - start
-    return ChunkRef(
-        offset, offset + 9 + start, stored, _COMPRESSIONS[name], size, crc, first, last, None, truncated
-    )
-
-
-def _add_attachment(found: Contents, content: memoryview) -> None:
-    """Parse an attachment and check its sum, which covers all but itself."""
-    attachment = _parse(Attachment.read, content)
-    names = len(attachment.name.encode()) + len(attachment.media_type.encode())
-    end = 32 + names + len(attachment.data)  # the record may be padded behind its check sum
-    (crc,) = struct.unpack_from("<I", content, end)
-    if crc and zlib.crc32(content[:end]) != crc:
-        found.report(f"The attachment {attachment.name!r} fails its check sum and was left out.")
-        found.complete = False
-        return
-    found.attachments.append(attachment)
 
 
 class _Linear:
@@ -315,7 +99,7 @@ class _Linear:
         found = self.found
         if opcode == 6:
             self.close_chunk()
-            found.chunks.append(_chunk(content, position))
+            found.chunks.append(chunk_at(content, position))
         elif opcode == 7:
             (channel,) = struct.unpack_from("<H", content)
             self.indexes[channel] = position
@@ -325,17 +109,17 @@ class _Linear:
                 raise ValueError("a message without a head")
             self.loose.setdefault(channel, []).append((log_time, position))
         elif opcode == 3:
-            schema = _parse(Schema.read, content)
+            schema = parse(Schema.read, content)
             found.schemas.setdefault(schema.id, schema)
         elif opcode == 4:
-            channel_record = _parse(Channel.read, content)
+            channel_record = parse(Channel.read, content)
             found.channels.setdefault(channel_record.id, channel_record)
         elif opcode == 12:
-            found.metadata.append(_parse(Metadata.read, content))
+            found.metadata.append(parse(Metadata.read, content))
         elif opcode == 9:
-            _add_attachment(found, content)
+            add_attachment(found, content)
         elif opcode == 1:
-            header = _parse(Header.read, content)
+            header = parse(Header.read, content)
             found.profile, found.library = header.profile, header.library
         elif opcode == 15:
             self.ended = True
@@ -359,7 +143,7 @@ class _Linear:
         if self.next_chunk(position + 1) >= 0:
             return 0
         try:
-            chunk = _chunk(self.data.view[position + 9 :], position, truncated=True)
+            chunk = chunk_at(self.data.view[position + 9 :], position, truncated=True)
         except (struct.error, ValueError):
             return 0
         self.close_chunk()

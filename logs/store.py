@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from logs.chunks import ChunkError, ChunkRef, decompress, heads, index_by_walking
 from logs.container import INDEX_ENTRY
-from logs.scan import Contents, FileBytes
+from logs.contents import Contents, FileBytes
 
 LOOSE = -1
 """Number of the pseudo-chunk of messages outside of chunks; its records are the file itself."""
