@@ -22,6 +22,9 @@ Image = NDArray[np.uint8]
 GROWTH_SIGMA_PX = 0.12
 BLUR_LOG_SIGMA = 0.4
 START_BLUR_PX = 0.62
+MAX_PIXELS = 1600
+MAX_MISFIT = 0.2
+"""Residual, as a share of the contrast, beyond which the rough fit is not refined."""
 
 
 @dataclass(slots=True)
@@ -33,6 +36,15 @@ class _Patch:
     x: Array
     y: Array
     value: Array
+
+    def thinned(self, limit: int) -> _Patch:
+        """Return at most about ``limit`` of the pixels, spread evenly."""
+        step = -(-len(self.u) // limit)
+        if step <= 1:
+            return self
+        # A step that shares no factor with the rows' length would leave stripes; a fixed shuffle does not.
+        pick = np.sort(np.random.default_rng(len(self.u)).permutation(len(self.u))[: len(self.u) // step])
+        return _Patch(self.u[pick], self.v[pick], self.x[pick], self.y[pick], self.value[pick])
 
 
 def _patch(image: Image, plane: LevelPlane, centre: Array, radius: float, border_px: float) -> _Patch | None:
@@ -87,7 +99,7 @@ def fit_area(
     margin_m: float,
     tilt_sigma_rad: float = 0.0,
     sectors: int = 1,
-    scales: tuple[float, ...] = (0.86, 0.9, 0.95, 1.0, 1.05, 1.1, 1.16),
+    scales: tuple[float, ...] = (0.88, 0.94, 1.0, 1.06, 1.12),
 ) -> Fit | None:
     """Fit the whole target at once; parameters and result as in ``fit_profiles``.
 
@@ -99,28 +111,32 @@ def fit_area(
     if patch is None:
         return None
     model = _Model(patch, edges_m, margin_m, unit, sectors, tilt_sigma_rad)
+    coarse = _Model(patch.thinned(300), edges_m, margin_m, unit, 1, 0.0)
     starts = []
     for scale in scales:
-        equations = model.equations(_State(plane, centre, kappa * scale, np.zeros(2), START_BLUR_PX, 0.0))
+        equations = coarse.equations(_State(plane, centre, kappa * scale, np.zeros(2), START_BLUR_PX, 0.0))
         if equations is not None:
             starts.append((equations.mean_square / equations.contrast**2, kappa * scale))
-    starts.sort()
-    best: tuple[float, _State, _Equations] | None = None
-    for _, start in starts[:2]:
-        state = _State(plane, centre, start, np.zeros(2), START_BLUR_PX, 0.0)
-        solved = model.descend(state)
-        if solved is not None:
-            misfit = solved.mean_square / solved.contrast**2
-            if best is None or misfit < best[0]:
-                best = misfit, state, solved
-    if best is None:
+    if not starts:
         return None
-    _, state, solved = best
+    starts.sort()
+    rough = _State(plane, centre, starts[0][1], np.zeros(2), START_BLUR_PX, 0.0)
+    model = _Model(patch.thinned(300), edges_m, margin_m, unit, sectors, tilt_sigma_rad)
+    solved = model.descend(rough, 8, 0.03)
+    if solved is None or solved.mean_square > (MAX_MISFIT * solved.contrast) ** 2:
+        return None
+    state = _State(rough.plane, rough.centre, rough.kappa, rough.tilt, rough.blur_px, rough.growth_px)
+    model = _Model(patch.thinned(MAX_PIXELS), edges_m, margin_m, unit, sectors, tilt_sigma_rad)
+    solved = model.descend(state, 8, 0.004)
+    if solved is None:
+        return None
     # The same pixels with the same weights, explained by a disc.
     disc = _State(state.plane, state.centre, state.kappa, np.zeros(2), state.blur_px, 0.0)
-    plain = _Model(patch, edges_m[:1], margin_m, unit, sectors, 0.0, solved.used, solved.weight).descend(disc)
+    plain = _Model(
+        model.patch, edges_m[:1], margin_m, unit, sectors, 0.0, solved.used, solved.weight
+    ).descend(disc, 6, 0.03)
     gain = 1.0 if plain is None else plain.mean_square / solved.mean_square
-    return _result(state, solved, gain, edges_m, patch)
+    return _result(state, solved, gain, edges_m, model.patch)
 
 
 @dataclass(slots=True)
@@ -261,12 +277,12 @@ class _Model:
         s = self.sectors
         return np.maximum(linear[:n, :s] @ coefficients[s : 2 * s], 0.0), float(coefficients[2 * s])
 
-    def descend(self, state: _State) -> _Equations | None:
+    def descend(self, state: _State, iterations: int, tolerance: float) -> _Equations | None:
         """Move ``state`` to the best fit and return the equations there."""
         equations = None
         if self.sectors > 1:
             state.scale = 60.0
-        for _ in range(15):
+        for _ in range(iterations):
             equations = self.equations(state)
             if equations is None:
                 return None
@@ -289,7 +305,7 @@ class _Model:
                 state.plane = state.plane.tilted(rotation_xy(full[3], full[4]))
             if not (state.kappa > 0.0 and np.isfinite(state.centre).all()):
                 return None
-            if size < 0.003:
+            if size < tolerance:
                 break
         return equations
 

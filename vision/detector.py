@@ -14,7 +14,7 @@ from vision.camera import Camera, check_rotation
 from vision.ellipse import plane_rotations
 from vision.plane import LevelPlane, rotation_to_level, rotation_vector_xy, rotation_xy
 from vision.redness import ratio_table, red_mask
-from vision.refine import MIN_GAP_PX, MIN_RADIUS_PX, Fit, edge_gaps, fit_profiles
+from vision.refine import Fit, fit_profiles, usable_edges
 from vision.rings import (
     Contours,
     Hypothesis,
@@ -38,10 +38,14 @@ THESIS_RELATIVE_SIGMA = 0.07
 MAX_DECK_TILT_RAD = 0.27
 SMALL_PX = 80.0
 """Outer diameter below which all pixels of the target are fitted where its edges could not be."""
-MIN_GAIN_OVER_DISC = 3.0
+FEW_PIXELS = 250
+MIN_GAIN_OVER_DISC = 8.0
 """How many times worse a plain disc has to fit than the target."""
-MIN_GAIN_OVER_SMALL_DISC = 1.8
+MIN_GAIN_OVER_SMALL_DISC = 2.5
 """The same where so few pixels show the target that its rings are hardly resolved."""
+MAX_FITS = 16
+MAX_AREA_FITS = 6
+"""Limits of the work spent on one image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,18 +227,20 @@ class TargetDetector:
         if not p[2] > 0.0:
             return None
         candidate = _Candidate(Hypothesis(p[:2] / p[2], 1.0 / float(p[2]), (), 1.0), plane, tilt)
-        fit = self._fit(image, candidate, rotation is None)
+        left = {"fits": 1, "area": 1}
+        fit = self._fit(image, candidate, rotation is None, left)
         return None if isinstance(fit, str) else self._fix([fit], rotation, "tracked")
 
     def _search(self, image: Image, rotation: Array | None, rate: Array | None) -> VisionFix | NoFix:
         reason = "no red region of the target's kind"
+        left = {"fits": MAX_FITS, "area": MAX_AREA_FITS}
         for contours in self._contour_sets(image):
             for candidates in self._candidates(contours, rotation, rate):
                 accepted: list[Fit] = []
                 for candidate in candidates:
-                    fit = self._fit(image, candidate, rotation is None)
+                    fit = self._fit(image, candidate, rotation is None, left)
                     if isinstance(fit, str):
-                        reason = fit
+                        reason = fit or reason
                         continue
                     accepted.append(fit)
                     if rotation is not None and _beyond_doubt(fit):
@@ -262,7 +268,7 @@ class TargetDetector:
             plane = LevelPlane(self.camera, rotation, rate)
             yield [_Candidate(h, plane, level) for h in identify_circles(contours, plane, self._edges)]
             yield [_Candidate(h, plane, level) for h in identify_votes(contours, plane, self._edges)]
-        candidates = []
+        candidates: list[_Candidate] = []
         for plane in self._ellipse_planes(contours, rate):
             tilt = level
             if rotation is not None:
@@ -273,7 +279,7 @@ class TargetDetector:
                     continue
                 plane = LevelPlane(self.camera, turn @ rotation, rate)
             candidates += [_Candidate(h, plane, tilt) for h in identify_circles(contours, plane, self._edges)]
-        yield candidates
+        yield sorted(candidates, key=lambda c: -c.hypothesis.score)
 
     def _ellipse_planes(self, contours: Contours, rate: Array | None) -> Iterator[LevelPlane]:
         """Yield the planes in which one of the longest contours is a circle."""
@@ -289,19 +295,25 @@ class TargetDetector:
                 for rotation in plane_rotations(x[mine][ok], y[mine][ok], max_rms):
                     yield LevelPlane(self.camera, rotation, rate)
 
-    def _fit(self, image: Image, candidate: _Candidate, free: bool) -> Fit | str:
-        """Fit a candidate and judge it: the fit, or the reason why it is none."""
+    def _fit(self, image: Image, candidate: _Candidate, free: bool, left: dict[str, int]) -> Fit | str:
+        """Fit a candidate and judge it: the fit, or the reason why it is none.
+
+        ``left`` counts down what may still be tried on this image; where nothing is left the reason is empty.
+        """
         plane, hypothesis = candidate.plane, candidate.hypothesis
         unit = float(plane.units_per_pixel(hypothesis.centre[0], hypothesis.centre[1]))
         to_px = hypothesis.kappa / unit
-        usable = (edge_gaps(self._edges) * to_px > MIN_GAP_PX) & (self._edges * to_px > MIN_RADIUS_PX)
+        usable = usable_edges(self._edges, to_px)
         sigma = (
             FREE_TILT_SIGMA_RAD
             if free
             else float(np.hypot(self.attitude_sigma_rad, self.deck_tilt_sigma_rad))
         )
         if usable.sum() < min(3, len(self._edges)):
-            return self._fit_small(image, candidate, sigma)
+            return self._fit_small(image, candidate, sigma, left)
+        if left["fits"] <= 0:
+            return ""
+        left["fits"] -= 1
 
         def fit_with(tilt_sigma_rad: float) -> Fit | None:
             return fit_profiles(
@@ -322,12 +334,17 @@ class TargetDetector:
                 fit = tilted
         judged = _judge_profiles(fit, self.min_share)
         if isinstance(judged, str) and 2.0 * self._edges[0] * to_px < SMALL_PX:
-            small = self._fit_small(image, candidate, sigma)
+            small = self._fit_small(image, candidate, sigma, left)
             return judged if isinstance(small, str) else small
         return judged
 
-    def _fit_small(self, image: Image, candidate: _Candidate, tilt_sigma_rad: float) -> Fit | str:
+    def _fit_small(
+        self, image: Image, candidate: _Candidate, tilt_sigma_rad: float, left: dict[str, int]
+    ) -> Fit | str:
         """Fit all pixels of a small target: in one light first, then with a light for each sector."""
+        if left["area"] <= 0:
+            return ""
+        left["area"] -= 1
         hypothesis = candidate.hypothesis
         best: Fit | None = None
         reason = ""
@@ -439,21 +456,25 @@ def _judge_profiles(fit: Fit | None, min_share: float) -> Fit | str:
         return "rings of the target's ratios, but too few of their edges fit"
     if fit.share < min_share:
         return f"only {fit.share:.0%} of the visible edges fit the target"
-    if len(fit.edges) < min(3, fit.n_visible) or len(fit.edges) < 2 or fit.count < 16:
+    if len(fit.edges) < max(2, min(3, fit.n_visible)) or fit.count < 16:
         return f"only {len(fit.edges)} edge(s) of the target fit"
-    if fit.residual_px > 0.6:
-        return f"edges are {fit.residual_px:.1f} px off the target's"
+    if fit.residual_px > 0.2 * max(1.0, fit.blur_px) or abs(fit.growth_px) > 0.6 * max(1.0, fit.blur_px):
+        return f"edges are {max(fit.residual_px, abs(fit.growth_px)):.1f} px off the target's"
     if not fit.covariance[2, 2] < (0.05 * fit.kappa) ** 2:
         return "the scale is not observable"
     return fit
 
 
 def _judge_area(fit: Fit | None, min_share: float) -> Fit | str:
+    """Judge a fit of all pixels; the limits lie between what targets and what look-alikes were seen to give."""
     if fit is None:
         return "a small red region that is no target"
-    if fit.share < min_share or fit.residual_px > 0.12:
+    few = fit.count < FEW_PIXELS
+    if fit.share < min_share or fit.residual_px > (0.085 if few else 0.07):
         return f"a small red region that differs from the target by {fit.residual_px:.0%} of its contrast"
-    if fit.chi2 < (MIN_GAIN_OVER_DISC if fit.count > 150 else MIN_GAIN_OVER_SMALL_DISC):
+    if not 0.28 < fit.blur_px < 1.8 or abs(fit.growth_px) > 0.35:
+        return "a small red region whose edges are not as sharp as the target's"
+    if fit.chi2 < (MIN_GAIN_OVER_SMALL_DISC if few else MIN_GAIN_OVER_DISC):
         return "a small red disc without visible rings"
     if not fit.covariance[2, 2] < (0.1 * fit.kappa) ** 2:
         return "the scale is not observable"

@@ -97,6 +97,16 @@ def edge_gaps(edges_m: Array) -> Array:
     return np.minimum(np.concatenate(([np.inf], steps)), np.concatenate((steps, [2.0 * edges_m[-1]])))
 
 
+def usable_edges(edges_m: Array, to_px: float) -> NDArray[np.bool_]:
+    """Return which edges can be measured one by one, at ``to_px`` pixels per metre."""
+    steps = -np.diff(edges_m) * to_px
+    outside = np.concatenate(([np.inf], steps))
+    inside = np.concatenate((steps, [2.0 * edges_m[-1] * to_px]))
+    near, far = np.minimum(outside, inside), np.maximum(outside, inside)
+    apart: NDArray[np.bool_] = (near > MIN_GAP_PX) | ((near > 0.7 * MIN_GAP_PX) & (far > 1.4 * MIN_GAP_PX))
+    return apart & (edges_m * to_px > MIN_RADIUS_PX)
+
+
 def phi(t: Array) -> Array:
     """Return the normal distribution function, to 3e-4 (Page's formula with tanh)."""
     return 0.5 + 0.5 * np.tanh(_SQRT_2_OVER_PI * t * (1.0 + 0.044715 * t * t))
@@ -113,9 +123,9 @@ def sample_lines(
     image: Image, plane: LevelPlane, centre: Array, kappa: float, edges_m: Array, widen: float, n_lines: int
 ) -> _Lines | None:
     """Lay lines of pixels across the edges that lie inside the image; None where there are too few."""
-    radius_px = kappa * edges_m / float(plane.units_per_pixel(centre[0], centre[1]))
-    gap_px = kappa * edge_gaps(edges_m) / float(plane.units_per_pixel(centre[0], centre[1]))
-    usable = np.flatnonzero((gap_px > MIN_GAP_PX) & (radius_px > MIN_RADIUS_PX))
+    to_px = kappa / float(plane.units_per_pixel(centre[0], centre[1]))
+    radius_px = to_px * edges_m
+    usable = np.flatnonzero(usable_edges(edges_m, to_px))
     if not len(usable):
         return None
     want = np.clip(2.5 * radius_px[usable], 10.0, 30.0)
