@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from logs.dataflash_format import DataflashLog, text_of
 from logs.sensors import Stamps, Times
-from logs.stamps import gps_to_utc_ns, in_order, near, to_ns
+from logs.stamps import common_offset, gps_to_utc_ns, in_order, near, to_ns
 
 Table = NDArray[np.void]
 
@@ -110,4 +110,4 @@ class TimedTables:
         if not good.any():
             return None
         utc = gps_to_utc_ns(table["GWk"][good], table["GMS"][good])
-        return int(np.sort(utc - stamp[good])[len(utc) // 2])
+        return common_offset(utc, stamp[good])

@@ -14,6 +14,7 @@ from logs.vehicles import Autopilot
 
 _BODY_FRAMES = (8, 12)
 _LONGEST_TRIP_NS = 1_000_000_000
+_LATEST_CLOCK_NS = 4_000_000_000_000_000_000
 _EARLIEST_NS, _LATEST_NS = -100_000_000, 5_000_000_000
 
 
@@ -56,7 +57,8 @@ def _exchanges(autopilot: Autopilot, sender: tuple[int, int] | None) -> tuple[in
     arrivals. Replies whose request is not in the log, and what the autopilot asked itself, are passed over.
     """
     asked = autopilot.others("TIMESYNC")
-    asked = asked[asked.data["tc1"] == 0]
+    ts1 = asked.data["ts1"]
+    asked = asked[(asked.data["tc1"] == 0) & (ts1 >= 0) & (ts1 < _LATEST_CLOCK_NS)]
     if not len(asked):
         return None
     own = (asked.system == sender[0]) & (asked.component == sender[1]) if sender is not None else None
@@ -74,6 +76,7 @@ def _exchanges(autopilot: Autopilot, sender: tuple[int, int] | None) -> tuple[in
     request = order[place]
     trip = replies.arrival_ns - asked.arrival_ns[request]
     good = (sent[request] == replies.data["ts1"]) & (trip >= 0) & (trip < _LONGEST_TRIP_NS)
+    good &= near(replies.data["tc1"], autopilot.centre_ns)
     _, first = np.unique(replies.data["ts1"][good], return_index=True)
     rows = np.flatnonzero(good)[np.sort(first)]
     remote = replies.data["tc1"][rows].copy()

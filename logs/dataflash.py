@@ -11,7 +11,6 @@ garbage follows is kept too, unless an intact message begins inside it: then its
 
 from __future__ import annotations
 
-import mmap
 import struct
 from collections import Counter
 from pathlib import Path
@@ -40,16 +39,9 @@ def read_dataflash(path: Path) -> DataflashLog:
 
     Raises LogError when the file is empty or holds no format definition or no message.
     """
-    with path.open("rb") as file:
-        size = file.seek(0, 2)
-        if size == 0:
-            raise LogError(path, "the file is empty", "copy the log again")
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
-            data: NDArray[np.uint8] = np.frombuffer(mapped, dtype=np.uint8)
-            try:
-                return decode_dataflash(data, path)
-            finally:
-                del data
+    if path.stat().st_size == 0:
+        raise LogError(path, "the file is empty", "copy the log again")
+    return decode_dataflash(np.asarray(np.memmap(path, dtype=np.uint8, mode="r")), path)
 
 
 def decode_dataflash(data: NDArray[np.uint8], path: str | Path = "log") -> DataflashLog:

@@ -14,7 +14,7 @@ from logs.mavlink import import_telemetry
 from logs.merge import merge
 from logs.px4 import MAGIC, import_ulog
 from logs.recording import Recording
-from logs.review import review
+from logs.review import drop_unstorable, review
 from logs.tlog import is_telemetry
 
 DATAFLASH = "ArduPilot dataflash log"
@@ -56,6 +56,7 @@ def import_files(paths: Sequence[str | Path], system: int | None = None) -> Reco
     out = parts[0]
     if len(parts) == 2:
         out = merge(parts[0], parts[1], (onboard[0].name, telemetry[0].name))
+    drop_unstorable(out)
     if not any(len(s) for s in out.series):
         raise LogError(files[0], "the log holds no message that can be used", "check that it is of a flight")
     out.series = [s for s in out.series if len(s)]

@@ -12,7 +12,7 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,11 +44,12 @@ from logs.sensors import (
     range_series,
     velocity_series,
 )
-from logs.stamps import in_order, near, to_ns
+from logs.stamps import common_offset, in_order, near, to_ns
 
 MAGIC = b"ULog\x01\x12\x35"
 
 _GAUSS_T = 1e-4
+_CALLS = 200_000
 _DOWNWARD = 25
 _STATUS = np.array([NO_FIX, NO_FIX, NO_FIX, FIX, FIX, RTK_FLOAT, RTK_FIXED, NO_FIX, FIX], dtype=np.int8)
 _LEVELS = (FATAL, FATAL, FATAL, ERROR, WARN, INFO, INFO, DEBUG)
@@ -137,15 +138,51 @@ class _Tables:
         return to_ns(sampled if np.all(sampled > 0) else data["timestamp"])
 
 
+class EndlessSearchError(Exception):
+    """A file is read again and again without getting further."""
+
+
+@dataclass(slots=True)
+class _Watched:
+    """A file for pyulog, whose search for the next message runs in circles over some damaged logs."""
+
+    file: BinaryIO
+    size: int
+    furthest: int = 0
+    calls: int = 0
+
+    def read(self, count: int = -1) -> bytes:
+        """Read as the file does; raises EndlessSearchError after many calls that did not get further in the file."""
+        data = self.file.read(count)
+        self.calls += 1
+        at = self.file.tell()
+        if at > self.furthest:
+            self.furthest, self.calls = at, 0
+        elif self.calls > max(_CALLS, self.size // 4):
+            raise EndlessSearchError("its messages cannot be told apart")
+        return data
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Seek as the file does."""
+        return self.file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """Tell as the file does."""
+        return self.file.tell()
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+
 def _read(path: Path) -> _Tables:
     try:
         from pyulog import ULog
     except ImportError:
         raise LogError(path, "reading PX4 logs needs pyulog", "pip install 'deckfix[px4]'") from None
-    said = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said):
-            log = ULog(str(path), disable_str_exceptions=True)
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
+            log = ULog(_Watched(file, path.stat().st_size), disable_str_exceptions=True)
         tables = _collect(log)
     except Exception as error:  # pyulog raises whatever its parsing stumbles over
         kind = type(error).__name__
@@ -165,8 +202,11 @@ def _collect(log: Any) -> _Tables:
         if found.name in _TOPICS and found.multi_id == 0 and len(found.data["timestamp"]):
             topics[found.name] = dict(found.data)
     names = sorted({d.name for d in log.data_list})
-    parameters = {k: float(v) for k, v in log.initial_parameters.items()}
-    parameters |= {name: float(value) for _, name, value, *_ in log.changed_parameters}
+    given = [
+        *log.initial_parameters.items(),
+        *((name, value) for _, name, value, *_ in log.changed_parameters),
+    ]
+    parameters = {name: float(value) for name, value in given if isinstance(value, int | float)}
     tables = _Tables(topics, names, parameters, dict(log.msg_info_dict), [])
     if topics:
         every = np.concatenate([_Tables.stamps(d) for d in topics.values()])
@@ -188,9 +228,9 @@ def _find_utc(topics: dict[str, Data]) -> int | None:
         if data is None or "time_utc_usec" not in data:
             continue
         good = (data["time_utc_usec"] > 0) & (data["fix_type"] >= 3)
-        if good.any():
-            offsets = to_ns(data["time_utc_usec"])[good] - to_ns(data["timestamp"])[good]
-            return int(np.sort(offsets)[len(offsets) // 2])
+        found = common_offset(to_ns(data["time_utc_usec"])[good], to_ns(data["timestamp"])[good])
+        if found is not None:
+            return found
     return None
 
 

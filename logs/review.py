@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from logs.recording import Recording, Series
+from logs.stamps import DAY_NS, YEAR_2038_NS
 
 _NEEDED = (
     ("/imu", "no IMU data: the flight can be looked at, but nothing can be estimated from it"),
@@ -33,6 +34,26 @@ def review(recording: Recording) -> list[str]:
     if fixes and not any(np.any(s.data["status_status"] >= 0) for s in fixes):
         found.append("the GPS never had a fix")
     return found
+
+
+def drop_unstorable(recording: Recording) -> None:
+    """Leave out messages whose arrival, or whose stamp in UTC, is outside the years that a log can hold.
+
+    An arrival may lie between 1970 and 2038, a stamp between 1902 and 2038. The recording's problems tell how
+    many were left out.
+    """
+    lost = 0
+    for series in recording.series:
+        utc = series.stamp_ns.astype(np.float64) + float(recording.clock_offsets_ns.get(series.clock, 0))
+        good = (series.arrival_ns >= 0) & (series.arrival_ns < YEAR_2038_NS)
+        good &= np.abs(utc) < YEAR_2038_NS - DAY_NS
+        if not good.all():
+            lost += int(np.count_nonzero(~good))
+            series.stamp_ns = series.stamp_ns[good]
+            series.arrival_ns = series.arrival_ns[good]
+            series.data = series.data[good]
+    if lost:
+        recording.problems.append(f"{lost} messages with an impossible date were left out")
 
 
 def _gaps(series: Series) -> list[str]:

@@ -21,6 +21,9 @@ _LEAP_SECONDS = (
 """GPS time [s] from which on GPS has been ahead of UTC by so many seconds; 13 before (from 1999 on)."""
 
 DAY_NS = 86_400_000_000_000
+_YEAR_2000_NS = 946_684_800_000_000_000
+YEAR_2038_NS = 2**31 * 1_000_000_000
+"""First UTC [ns] that the 32-bit seconds of a ROS 2 time cannot hold."""
 _LARGEST_STAMP_NS = 9_000_000_000_000_000_000
 
 
@@ -45,6 +48,15 @@ def to_ns(microseconds: NDArray[np.generic]) -> Stamps:
         unsigned: Stamps = np.minimum(microseconds, np.uint64(limit)).astype(np.int64) * 1000
         return unsigned
     return np.clip(microseconds.astype(np.int64), -limit, limit) * 1000
+
+
+def common_offset(utc_ns: Stamps, stamp_ns: Stamps) -> int | None:
+    """Return UTC less a clock's stamps (n,), the median over the pairs whose UTC is between 2000 and 2038."""
+    good = (utc_ns > _YEAR_2000_NS) & (utc_ns < YEAR_2038_NS) & (stamp_ns < _LARGEST_STAMP_NS)
+    if not good.any():
+        return None
+    offsets = np.sort(utc_ns[good] - stamp_ns[good])
+    return int(offsets[len(offsets) // 2])
 
 
 def in_order(stamp_ns: Stamps) -> NDArray[np.bool_]:

@@ -156,7 +156,21 @@ def test_real_logs_equal_pymavlink_message_by_message(data_dir: Path, flight: st
     path = data_dir / "ardupilot_sitl" / f"{flight}.BIN"
     log = read_dataflash(path)
     reader = DFReader_binary(str(path))
-    wanted = "IMU GPS GPA BARO MAG XKF1 SIM SIM2 PARM MSG ORGN RFND UNIT".split()
+    wanted = [
+        "IMU",
+        "GPS",
+        "GPA",
+        "BARO",
+        "MAG",
+        "XKF1",
+        "SIM",
+        "SIM2",
+        "PARM",
+        "MSG",
+        "ORGN",
+        "RFND",
+        "UNIT",
+    ]
     seen = dict.fromkeys(wanted, 0)
     while (m := reader.recv_match(type=wanted)) is not None:
         name = m.get_type()
