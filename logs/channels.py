@@ -11,7 +11,7 @@ from typing import Any
 from estimation.events import AUTOPILOT
 from logs.contents import Contents
 from logs.errors import LogError
-from logs.events import FOREIGN
+from logs.event_columns import FOREIGN
 from logs.store import ChunkStore
 from logs.topics import TOPICS
 

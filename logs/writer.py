@@ -27,7 +27,8 @@ from logs.container import Container, create
 from logs.definition import parse
 from logs.encode import encode
 from logs.errors import LogError
-from logs.events import FOREIGN, series_of_event
+from logs.event_columns import FOREIGN
+from logs.events import series_of_event
 from logs.recording import Recording, Series
 from logs.topics import TOPICS, definition_text
 

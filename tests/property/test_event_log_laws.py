@@ -26,7 +26,8 @@ from estimation.events import (
     VisionFix,
 )
 from logs import FlightWriter, open_flight
-from logs.events import as_logged, degrees_of, events_of_series, series_of_batch
+from logs.event_columns import degrees_of
+from logs.events import as_logged, events_of_series, series_of_batch
 
 UTC = 1_700_000_000_000_000_000
 number = st.floats(-1e6, 1e6)

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.events import GpsPosition, GpsVelocity, Rangefinder
-from logs.events import FOREIGN, as_logged, events_of_series
+from logs.event_columns import FOREIGN
+from logs.events import as_logged, events_of_series
 from logs.recording import Series
 from logs.topics import new_rows
 
