@@ -13,17 +13,16 @@ of its middle row; ``readout_s`` is the time from the first row to just after th
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vision import tables
 from vision.lens import distort, undistort
 
 Array = NDArray[np.float64]
@@ -211,19 +210,12 @@ class Camera:
         """Read a ``camera.toml``; unknown or missing fields and wrong types are a ``ValueError`` naming the
         field.
         """
-        try:
-            fields = msgspec.convert(tomllib.loads(text), type=_CameraFile, strict=True)
-        except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-            raise ValueError(f"camera: {error}") from error
-        return cls(**msgspec.structs.asdict(fields))
+        return tables.from_toml(text, cls, "camera")
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:
         """Read a ``camera.toml`` file; ``ValueError`` names the file."""
-        try:
-            return cls.from_toml(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, ValueError) as error:
-            raise ValueError(f"{path}: not a camera file: {error}") from error
+        return tables.load(path, cls, "camera")
 
     def to_camera_info(self) -> dict[str, Any]:
         """Return the fields of sensor_msgs/CameraInfo that describe this camera (read-out time has none
@@ -294,19 +286,6 @@ class Camera:
             tuple(float(c) for c in np.asarray(distortion, dtype=np.float64).ravel()),
             readout_s,
         )
-
-
-class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
-    """The fields of a ``camera.toml``."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float | None = None
-    cy: float | None = None
-    distortion: tuple[float, ...] = ()
-    readout_s: float = 0.0
 
 
 def check_rotation(matrix: ArrayLike, name: str = "R_nc") -> Array:

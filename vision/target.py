@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,8 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from vision import tables
 
 Colour = tuple[int, int, int]
 
@@ -154,29 +155,12 @@ class RingTarget:
         """Read a ``target.toml``; unknown or missing fields and wrong types are a ``ValueError`` naming the
         field.
         """
-        try:
-            fields = msgspec.convert(tomllib.loads(text), type=_TargetFile, strict=True)
-        except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-            raise ValueError(f"target: {error}") from error
-        return cls(**msgspec.structs.asdict(fields))
+        return tables.from_toml(text, cls, "target")
 
     @classmethod
     def load(cls, path: str | Path) -> RingTarget:
         """Read a ``target.toml`` file; ``ValueError`` names the file."""
-        try:
-            return cls.from_toml(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, ValueError) as error:
-            raise ValueError(f"{path}: not a target file: {error}") from error
-
-
-class _TargetFile(msgspec.Struct, forbid_unknown_fields=True):
-    """The fields of a ``target.toml``."""
-
-    edges_m: tuple[float, ...]
-    board_m: float | None = None
-    red_rgb: Colour = RED
-    white_rgb: Colour = WHITE
-    name: str = "ring target"
+        return tables.load(path, cls, "target")
 
 
 def _radius(diameter_m: Any) -> float:
