@@ -329,6 +329,14 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
             "this is a defect: please report it with the log",
         )
         return
+    fastest = float(np.linalg.norm(result.run.velocity_mps, axis=1).max())
+    if fastest > 150.0:
+        yield Finding(
+            Severity.SERIOUS,
+            f"the estimate moves at up to {fastest:.0f} m/s, which no multirotor does",
+            "impossible inertial samples or positions in the log",
+            "look for the moment in the plots, and cut the log before or after it",
+        )
     worst = float(np.sqrt(variance.max(axis=1).clip(0.0)).max())
     if worst > 20.0:
         yield Finding(

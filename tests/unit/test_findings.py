@@ -116,3 +116,11 @@ def test_a_diverged_filter_is_serious() -> None:
     changed = replace(result, run=replace(result.run, position_m=position))
     assert having(symptoms(changed), "the estimate is not finite") is Severity.SERIOUS
     assert verdict(changed, findings(changed)).startswith("Do not rely on this estimate")
+
+
+def test_an_impossible_speed_is_serious() -> None:
+    result = synthetic_result(with_truth=False)
+    velocity = result.run.velocity_mps.copy()
+    velocity[500:505] = 4000.0
+    changed = replace(result, run=replace(result.run, velocity_mps=velocity))
+    assert having(symptoms(changed), "which no multirotor does") is Severity.SERIOUS
