@@ -159,16 +159,15 @@ def trace_contours(mask: Image, min_circumference: float = 0.0) -> list[Contour]
         for c, link in zip(outer, tree[0] if len(outer) else (), strict=True)
         if link[3] < 0
     ]
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.bitwise_not(mask), connectivity=4)
-    height, width = mask.shape
-    for k in range(1, count):
-        u, v, du, dv = (int(stats[k, i]) for i in range(4))
-        at_border = u == 0 or v == 0 or u + du == width or v + dv == height
-        if at_border or 2 * (du + dv) <= min_circumference:
-            continue
-        hole = (labels[v : v + dv, u : u + du] == k).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.bitwise_not(mask), connectivity=4)
+    u, v, du, dv, _ = stats.T
+    inside = (u > 0) & (v > 0) & (u + du < mask.shape[1]) & (v + dv < mask.shape[0])
+    inside[0] = False  # what is red
+    for k in np.flatnonzero(inside & (2 * (du + dv) > min_circumference)):
+        hole = (labels[v[k] : v[k] + dv[k], u[k] : u[k] + du[k]] == k).astype(np.uint8)
+        corner = np.array([u[k], v[k]], dtype=np.int32)
         for c in cv2.findContours(hole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
-            contours.append(np.asarray(c[:, 0], dtype=np.int32) + np.array([u, v], dtype=np.int32))
+            contours.append(np.asarray(c[:, 0], dtype=np.int32) + corner)
     return contours
 
 
