@@ -175,9 +175,10 @@ class JacobianCheck:
         """Return the verdict in one sentence."""
         if self.correct:
             return "the Jacobian agrees with finite differences"
+        given, found = (j[self.row, self.column] for j in (self.analytic, self.numeric))
         return (
-            f"the Jacobian is wrong: d(prediction {self.row}) / d({self.name}) is {self.analytic[self.row, self.column]:.6g}, "
-            f"finite differences give {self.numeric[self.row, self.column]:.6g}"
+            f"the Jacobian is wrong: d(prediction {self.row}) / d({self.name}) is {given:.6g}, "
+            f"finite differences give {found:.6g}"
         )
 
 
