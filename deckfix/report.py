@@ -193,13 +193,18 @@ def _wrong(found: list[Finding]) -> str:
         (_WORDS[f.severity], [_WORDS[f.severity], text(f.symptom), text(f.cause), text(f.remedy)])
         for f in found
     ]
-    return _table(heads, rows, css="findings")
+    lead = ""
+    if all(f.severity is Severity.NOTE for f in found):
+        lead = '<p class="lead">Nothing that matters. These are notes.</p>'
+    return lead + _table(heads, rows, css="findings")
 
 
 def _track(result: Result, plots: _Plots) -> str:
     if not len(result.run.t_ns):
         return ""
-    about = "Positions are relative to the origin below; references are shifted by their constant offset."
+    about = "North is up, and the plot is to scale."
+    if result.truth is not None or result.autopilot is not None:
+        about += " The other estimates are shifted by their constant offset."
     if result.run.origin is not None:
         lat, lon, alt = result.run.origin
         about += f" Origin: {np.rad2deg(lat):.6f}°, {np.rad2deg(lon):.6f}°, {alt:.1f} m."

@@ -129,9 +129,17 @@ class Result:
 
     @cached_property
     def unused(self) -> tuple[str, ...]:
-        """Names of the sensors none of whose measurements was ever tried: switched off, or never ready."""
-        nothing = {Outcome.REJECTED_NOT_READY}
-        return tuple(n for n in self.measured if set(self.outcomes(n)) == nothing)
+        """Names of the sensors whose measurements were never compared: switched off, or never ready.
+
+        At least nine in ten met ``REJECTED_NOT_READY``; single ones may have been late or repeated before.
+        """
+        out = []
+        for name in self.measured:
+            counts = self.outcomes(name)
+            idle = counts.get(Outcome.REJECTED_NOT_READY, 0) >= 0.9 * sum(counts.values())
+            if idle and self.nis(name) is None:
+                out.append(name)
+        return tuple(out)
 
     @cached_property
     def tried(self) -> NDArray[np.void]:
