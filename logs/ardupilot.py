@@ -135,7 +135,7 @@ def _gps(tables: TimedTables, parameters: Mapping[str, float], undulation: float
         ]
         if any(antenna):
             metadata["antenna_frd_m"] = " ".join(repr(a) for a in antenna)
-        status = _STATUS[np.minimum(rows["Status"], len(_STATUS) - 1)]
+        status = _STATUS[np.clip(rows["Status"], 0, len(_STATUS) - 1)]
         altitude = rows["Alt"] + (undulation or 0.0)
         sigmas = _matched(accuracies.get(instance), times, "HAcc", "VAcc", "SAcc")
         made.append(
@@ -258,10 +258,8 @@ def _truth(tables: TimedTables) -> list[Series]:
     rows, moves = attitude[0][at], motion[0][where]
     if not len(rows):
         return []
-    if has(rows, "Q1", "Q2", "Q3", "Q4"):
-        q = columns(*(rows[f"Q{k}"] for k in (1, 2, 3, 4)))
-    else:
-        q = _attitude(rows)
+    parts = ("Q1", "Q2", "Q3", "Q4")
+    q = columns(*(rows[n] for n in parts)) if has(rows, *parts) else _attitude(rows)
     metadata = {
         "source": "position and velocity SIM2, attitude SIM",
         "rates": "only stamps that both messages have; nothing is interpolated",

@@ -14,11 +14,22 @@ from logs.stamps import common_offset, gps_to_utc_ns, in_order, near, to_ns
 Table = NDArray[np.void]
 
 _INSTANCE_COLUMNS = ("I", "Instance", "Inst", "C")
+_TEXTS = {"Name", "Message", "FWS"}
+_INTEGERS = {
+    *_INSTANCE_COLUMNS, "Status", "GWk", "GMS", "ModeNum", "Subsys", "ECode", "Id", "Type", "Stat", "Orient", "PI",
+}  # fmt: skip
 
 
 def has(table: Table, *names: str) -> bool:
-    """Say whether a table has all of the columns."""
-    return set(names) <= set(table.dtype.names or ())
+    """Say whether a table has all of the columns, and each as text, integer or number as its meaning demands.
+
+    (A damaged format definition can make any of a number a text, or the reverse.)
+    """
+    if not set(names) <= set(table.dtype.names or ()):
+        return False
+    return all(
+        table.dtype[n].kind in ("S" if n in _TEXTS else "iu" if n in _INTEGERS else "iuf") for n in names
+    )
 
 
 @dataclass(slots=True)

@@ -119,10 +119,14 @@ def read_units(log: DataflashLog) -> None:
     if any(n not in log.tables for n in needed):
         return
     unit_table, link = log.tables["UNIT"], log.tables["FMTU"]
-    if not {"Id", "Label"} <= set(unit_table.dtype.names or ()) or not {"FmtType", "UnitIds"} <= set(
-        link.dtype.names or ()
+    for table, column, kinds in (
+        (unit_table, "Id", "iu"),
+        (unit_table, "Label", "S"),
+        (link, "FmtType", "iu"),
+        (link, "UnitIds", "S"),
     ):
-        return
+        if column not in (table.dtype.names or ()) or table.dtype[column].kind not in kinds:
+            return
     labels = {
         chr(int(i) & 0x7F): text_of(t) for i, t in zip(unit_table["Id"], unit_table["Label"], strict=True)
     }
