@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.plane import LevelPlane, rotation_xy
-from vision.refine import _INV_SQRT_2PI, Fit, brightness, edge_sides, phi
+from vision.refine import INV_SQRT_2PI, Fit, edge_sides, phi
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -36,6 +36,7 @@ class _Patch:
     x: Array
     y: Array
     value: Array
+    red: Array
 
     def thinned(self, limit: int) -> _Patch:
         """Return at most about ``limit`` of the pixels, spread evenly."""
@@ -44,7 +45,7 @@ class _Patch:
             return self
         # A step that shares no factor with the rows' length would leave stripes; a fixed shuffle does not.
         pick = np.sort(np.random.default_rng(len(self.u)).permutation(len(self.u))[: len(self.u) // step])
-        return _Patch(self.u[pick], self.v[pick], self.x[pick], self.y[pick], self.value[pick])
+        return _Patch(self.u[pick], self.v[pick], self.x[pick], self.y[pick], self.value[pick], self.red[pick])
 
 
 def _patch(image: Image, plane: LevelPlane, centre: Array, radius: float, border_px: float) -> _Patch | None:
@@ -60,7 +61,8 @@ def _patch(image: Image, plane: LevelPlane, centre: Array, radius: float, border
     vv, uu = np.mgrid[v0 : v1 + 1, u0 : u1 + 1]
     uu, vv = uu.ravel(), vv.ravel()
     x, y = plane.rays(uu, vv)
-    return _Patch(uu, vv, x, y, brightness(image, uu, vv))
+    pixels = image[vv, uu].astype(np.float64)
+    return _Patch(uu, vv, x, y, 0.5 * (pixels[:, 0] + pixels[:, 1]), pixels[:, 2])
 
 
 @dataclass(slots=True)
@@ -180,7 +182,7 @@ class _Model:
         bend = np.minimum(width * width / (2.0 * rk), 0.5 * rk)
         t = (rho[:, None] - rk + bend - sides * (state.growth_px * slope)[:, None]) / width
         cdf = phi(t) * sides
-        bell = np.exp(-0.5 * t * t) * (_INV_SQRT_2PI * sides) / width
+        bell = np.exp(-0.5 * t * t) * (INV_SQRT_2PI * sides) / width
         linear = self._light(ex / (kappa * edges_m[0]), ey / (kappa * edges_m[0]), cdf)
         n_lin = linear.shape[1]
         ridge = np.full(n_lin, 1e-3)
@@ -323,6 +325,16 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
     considered = np.zeros((5, 3))
     considered[rows] = shift[at]
     agrees = np.abs(solved.residual) < max(3.5 * np.sqrt(variance), 0.12 * solved.contrast)
+    u, v = patch.u[solved.used], patch.v[solved.used]
+    qx, qy = state.plane.from_rays(patch.x[solved.used], patch.y[solved.used], v.astype(np.float64))
+    ex, ey = qx - state.centre[0], qy - state.centre[1]
+    inside = agrees & (np.hypot(ex, ey) < 0.97 * state.kappa * edges_m[0])
+    value, red = patch.value[solved.used][inside], patch.red[solved.used][inside]
+    slope = float(np.cov(red, value)[0, 1] / max(float(value.var()), 1e-9)) if inside.sum() > 8 else 0.0
+    # What covers a target covers one side more than the other; another pattern disagrees all round.
+    sector = ((np.arctan2(ey, ex) / (2.0 * np.pi) % 1.0) * 8.0).astype(np.intp) % 8
+    share = np.bincount(sector, weights=agrees, minlength=8) / np.maximum(np.bincount(sector, minlength=8), 1)
+    even = float(agrees.mean()) < 0.9 and float(np.ptp(share)) < 0.2
     points = np.stack((patch.u[solved.used], patch.v[solved.used]), axis=1).astype(np.float64)
     return Fit(
         state.plane,
@@ -342,5 +354,7 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
         3 in free,
         points,
         agrees,
+        slope,
+        1.0 - float(agrees.mean()) if even else 0.0,
         True,
     )

@@ -43,6 +43,8 @@ MIN_GAIN_OVER_DISC = 8.0
 """How many times worse a plain disc has to fit than the target."""
 MIN_GAIN_OVER_SMALL_DISC = 2.5
 """The same where so few pixels show the target that its rings are hardly resolved."""
+MIN_RED_SLOPE = -0.35
+"""Least change of R per change of (G + B) / 2 from red to white; on blue water it is about -1."""
 MAX_FITS = 16
 MAX_AREA_FITS = 6
 """Limits of the work spent on one image."""
@@ -346,6 +348,9 @@ class TargetDetector:
             return ""
         left["area"] -= 1
         hypothesis = candidate.hypothesis
+        unit = float(candidate.plane.units_per_pixel(hypothesis.centre[0], hypothesis.centre[1]))
+        # Beyond this blur nothing of the rings is left.
+        max_blur_px = 0.8 * float(np.max(-np.diff(self._edges))) * hypothesis.kappa / unit
         best: Fit | None = None
         reason = ""
         for sectors in (1, 8):
@@ -359,7 +364,7 @@ class TargetDetector:
                 tilt_sigma_rad=tilt_sigma_rad,
                 sectors=sectors,
             )
-            judged = _judge_area(fit, self.min_share if sectors > 1 else 0.85)
+            judged = _judge_area(fit, self.min_share if sectors > 1 else 0.85, max_blur_px)
             if isinstance(judged, str):
                 reason = reason or judged
             elif best is None or judged.chi2 > best.chi2:
@@ -458,21 +463,29 @@ def _judge_profiles(fit: Fit | None, min_share: float) -> Fit | str:
         return f"only {fit.share:.0%} of the visible edges fit the target"
     if len(fit.edges) < max(2, min(3, fit.n_visible)) or fit.count < 16:
         return f"only {len(fit.edges)} edge(s) of the target fit"
-    if fit.residual_px > 0.2 * max(1.0, fit.blur_px) or abs(fit.growth_px) > 0.6 * max(1.0, fit.blur_px):
+    if fit.red_slope < MIN_RED_SLOPE:
+        return "red rings, but not on white"
+    if fit.contradicted > 0.2:
+        return f"where {fit.contradicted:.0%} of the edges should be is plain white"
+    if fit.residual_px > 0.12 * max(1.0, fit.blur_px) or abs(fit.growth_px) > 0.6 * max(1.0, fit.blur_px):
         return f"edges are {max(fit.residual_px, abs(fit.growth_px)):.1f} px off the target's"
     if not fit.covariance[2, 2] < (0.05 * fit.kappa) ** 2:
         return "the scale is not observable"
     return fit
 
 
-def _judge_area(fit: Fit | None, min_share: float) -> Fit | str:
+def _judge_area(fit: Fit | None, min_share: float, max_blur_px: float) -> Fit | str:
     """Judge a fit of all pixels; the limits lie between what targets and what look-alikes were seen to give."""
     if fit is None:
         return "a small red region that is no target"
     few = fit.count < FEW_PIXELS
     if fit.share < min_share or fit.residual_px > (0.085 if few else 0.07):
         return f"a small red region that differs from the target by {fit.residual_px:.0%} of its contrast"
-    if not 0.28 < fit.blur_px < 1.8 or abs(fit.growth_px) > 0.35:
+    if fit.red_slope < MIN_RED_SLOPE:
+        return "a small red region, but not on white"
+    if fit.contradicted > 0.0:
+        return "a small red region whose rings have other radii"
+    if not 0.28 < fit.blur_px < min(1.8, max_blur_px) or abs(fit.growth_px) > 0.35:
         return "a small red region whose edges are not as sharp as the target's"
     if fit.chi2 < (MIN_GAIN_OVER_SMALL_DISC if few else MIN_GAIN_OVER_DISC):
         return "a small red disc without visible rings"

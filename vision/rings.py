@@ -195,6 +195,9 @@ def _label(
     outside &= radius[None, :] > 1.15 * predicted[:, :1] + unit[None, :]
     score[outside.any(axis=1)] = 0.0
     hypotheses: list[Hypothesis] = []
+    clear = int(np.argmax(score))
+    if score[clear] > 0.6 and n_matched[clear] >= min(4, len(edges_m)):
+        limit = 1
     for t in np.argsort(-score, kind="stable"):
         if score[t] <= 0.0 or len(hypotheses) == limit:
             break
