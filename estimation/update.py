@@ -142,14 +142,22 @@ def reset_datum(kind: int, x: Array, P: Array, r: Array, R: Array, dimension: in
         x[place + i] += r[i]
         P[block + i, :] = 0.0
         P[:, block + i] = 0.0
-        P[block + i, block + i] = R[i, i]
-    bias = offsets[GPS_BIAS]
-    if kind == GPS_POSITION and bias >= 0:
-        # position = fix - bias: what is not known of the bias is not known of the position.
+    # The state is now what the sensor says less what else is in its reading: position = fix - GPS bias, offset of
+    # the barometer = reading + position down. It hangs together with that as the reading does, and on its noise.
+    other, sign = -1, 0.0
+    if kind == GPS_POSITION:
+        other, sign = offsets[GPS_BIAS], -1.0
+    elif kind == BAROMETER:
+        other, sign = offsets[POSITION] + 2, 1.0
+    if other >= 0:
+        for i in range(dimension):
+            for c in range(P.shape[0]):
+                P[block + i, c] = sign * P[other + i, c]
+        for i in range(dimension):
+            for c in range(P.shape[0]):
+                P[c, block + i] = P[block + i, c]
         for i in range(dimension):
             for j in range(dimension):
-                P[block + i, block + j] += P[bias + i, bias + j]
-                P[block + i, bias + j] = -P[bias + i, bias + j]
-                P[bias + j, block + i] = -P[bias + i, bias + j]
-    elif kind == BAROMETER:
-        P[block, block] += P[offsets[POSITION] + 2, offsets[POSITION] + 2]
+                P[block + i, block + j] = P[other + i, other + j]
+    for i in range(dimension):
+        P[block + i, block + i] += R[i, i]
