@@ -2,17 +2,18 @@
 
 A synthetic flight (IMU 200 Hz, attitude 50 Hz, GPS 5 Hz, JPEG-like images of 40 kB at 30 Hz) is written
 twice: by our writer (images in chunks of their own) and by the stock ``mcap`` writer (all topics in the
-same zstd chunks). Of each file the IMU and GPS topics are read in three ways, interleaved, and timed in CPU
+same zstd chunks). Of each file the IMU and GPS topics are read in four ways, interleaved, and timed in CPU
 seconds:
 
-- columns:  ``logs.open_flight(path).load(topics)``, opening, check sums and decoding to NumPy included; -
-iterate:  ``mcap.reader.make_reader(...).iter_messages(topics)``, bytes only, default options; - decode:
-the same with ``iter_decoded_messages`` and the decoder of ``mcap-ros2-support``.
+- columns: ``logs.open_flight(path).load(topics)``, opening, check sums and decoding to NumPy included;
+- iterate: ``mcap.reader.make_reader(...).iter_messages(topics)``, bytes only, default options;
+- checked: the same with ``validate_crcs=True``, as our reader always does;
+- decode: ``iter_decoded_messages(topics)`` with the decoder of ``mcap-ros2-support``.
 
 Ratios are formed within each round; printed are their median, smallest and largest. The work of writing
 each message to the log in bulk, and of one live event, is printed beside them.
 
-python benchmarks/read_columns.py [--duration 120] [--rounds 5] [--json FILE]
+    python benchmarks/read_columns.py [--duration 120] [--rounds 5] [--json FILE]
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ import platform
 import tempfile
 import time
 from collections.abc import Callable
+from datetime import UTC as UTC_ZONE
+from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -100,13 +103,23 @@ def iterate(path: Path) -> int:
         return sum(1 for _ in make_reader(stream).iter_messages(topics=list(TOPICS)))
 
 
+def checked(path: Path) -> int:
+    with path.open("rb") as stream:
+        return sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages(topics=list(TOPICS)))
+
+
 def decode(path: Path) -> int:
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         return sum(1 for _ in reader.iter_decoded_messages(topics=list(TOPICS)))
 
 
-WAYS: dict[str, Callable[[Path], int]] = {"columns": columns, "iterate": iterate, "decode": decode}
+WAYS: dict[str, Callable[[Path], int]] = {
+    "columns": columns,
+    "iterate": iterate,
+    "checked": checked,
+    "decode": decode,
+}
 
 
 def measure(path: Path, rounds: int, expected: int) -> dict[str, Any]:
@@ -122,7 +135,7 @@ def measure(path: Path, rounds: int, expected: int) -> dict[str, Any]:
     for name, times in seconds.items():
         result[f"{name}_s"] = spread(np.array(times))
         result[f"{name}_us_per_message"] = round(float(np.median(times)) / expected * 1e6, 3)
-    for name in ("iterate", "decode"):
+    for name in ("iterate", "checked", "decode"):
         result[f"{name}_over_columns"] = spread(np.array(seconds[name]) / np.array(seconds["columns"]))
     return result
 
@@ -164,6 +177,7 @@ def main() -> None:
         bulk = write_ours(ours, series, arguments.duration, rng)
         rewrite_mixed(ours, mixed)
         results: dict[str, Any] = {
+            "date": datetime.now(UTC_ZONE).date().isoformat(),
             "duration_s": arguments.duration,
             "rounds": arguments.rounds,
             "python": platform.python_version(),
@@ -179,15 +193,18 @@ def main() -> None:
     print(
         f"{expected} IMU and GPS messages, {arguments.duration:.0f} s, n = {arguments.rounds} rounds, CPU time"
     )
-    print(f"{'file':8}{'MB':>8}{'columns us':>12}{'iterate us':>12}{'decode us':>11}", end="")
-    print(f"{'iterate/columns':>26}{'decode/columns':>26}")
+    print(
+        f"{'file':8}{'MB':>8}{'columns us':>12}{'iterate us':>12}{'checked us':>12}{'decode us':>11}", end=""
+    )
+    print(f"{'iterate/columns':>25}{'checked/columns':>25}{'decode/columns':>25}")
     for name, found in results["files"].items():
         print(f"{name:8}{found['megabytes']:8.1f}", end="")
-        for way, width in (("columns", 12), ("iterate", 12), ("decode", 11)):
+        for way, width in (("columns", 12), ("iterate", 12), ("checked", 12), ("decode", 11)):
             print(f"{found[f'{way}_us_per_message']:{width}.2f}", end="")
-        for way in ("iterate", "decode"):
+        for way in ("iterate", "checked", "decode"):
             r = found[f"{way}_over_columns"]
-            print(f"{r['median']:12.1f} ({r['min']:.1f} - {r['max']:.1f})", end="")
+            text = f"{r['median']:.1f} ({r['min']:.1f} - {r['max']:.1f})"
+            print(f"{text:>25}", end="")
         print()
     print(f"bulk write {results['bulk_write_us_per_message']:.2f} us a message,", end=" ")
     print(f"live event {results['live_event_us']:.1f} us")

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from estimation.events import AUTOPILOT
 from logs.contents import Contents
 from logs.errors import LogError
@@ -84,17 +87,15 @@ def channel_infos(
     contents: Contents, store: ChunkStore, offsets: Mapping[str, int]
 ) -> dict[int, ChannelInfo]:
     """Return what is known of each channel, counting the messages of its indexes."""
-    counts: dict[int, int] = {}
-    first: dict[int, int] = {}
-    last: dict[int, int] = {}
+    times: dict[int, list[NDArray[np.uint64]]] = {}
     for chunk in store.numbers():
         for number, entries in store.index(chunk).items():
-            if not len(entries):
-                continue
-            low, high = int(entries["log"].min()), int(entries["log"].max())
-            counts[number] = counts.get(number, 0) + len(entries)
-            first[number] = min(first.get(number, low), low)
-            last[number] = max(last.get(number, high), high)
+            if len(entries):
+                times.setdefault(number, []).append(entries["log"])
+    logs = {number: np.concatenate(parts) for number, parts in times.items()}
+    counts = {number: len(log) for number, log in logs.items()}
+    first = {number: int(log.min()) for number, log in logs.items()}
+    last = {number: int(log.max()) for number, log in logs.items()}
     unknown = sum(n for c, n in counts.items() if c not in contents.channels)
     if unknown:
         contents.report(f"{unknown} messages belong to channels whose description is lost.")

@@ -37,10 +37,11 @@ class Raw:
     ) -> None:
         """Gather the messages at the offsets; ``base`` places the chunk among the others."""
         sizes = head["length"].astype(np.int64) - 22
-        for size in np.unique(sizes).tolist():
-            chosen = sizes == size
+        one_size = bool((sizes == sizes[:1]).all())
+        for size in sizes[:1].tolist() if one_size else np.unique(sizes).tolist():
+            chosen = slice(None) if one_size else sizes == size
             if size < 4:
-                self.too_short += int(chosen.sum())
+                self.too_short += len(sizes[chosen])
                 continue
             self.logs.setdefault(size, []).append(head["log"][chosen].astype(np.int64))
             self.places.setdefault(size, []).append(base + offsets[chosen])

@@ -5,8 +5,7 @@ rotational covariance is about the fixed axes of the former. The estimator says:
 error as a rotation vector in the body frame. These functions turn the one into the other and back:
 
 - twist.linear is ``R_bn v_n``, body axes (FRD); its covariance is that of the NED velocity turned into body
-axes,
-  the attitude's own uncertainty left out, so that it can be turned back;
+  axes, the attitude's own uncertainty left out, so that it can be turned back;
 - rotational pose covariance is ``R_nb P_b R_nb^T``;
 - correlations of velocity with position and attitude have no place in the message and come back as zero;
 - no covariance at all (truth, another estimator's attitude) is written as zeros.

@@ -119,8 +119,7 @@ class FlightWriter:
 
         Raises:
             LogError: a topic is unknown and names no message type (metadata ``message_type``), columns do not
-            fit
-                it, or a time cannot be stored.
+                fit it, or a time cannot be stored.
         """
         blocks = [self._block(s) for s in series if len(s)]
         if not blocks:
