@@ -29,6 +29,7 @@ STAMP_SEC = "/sec"
 STAMP_NANOSEC = "/nanosec"
 FRAME_ID = "header_frame_id"
 _MAX_LEAVES = 4096
+_MAX_BYTES = 1 << 22
 _NS = 1_000_000_000
 _XYZ = (Field("x", "float64"), Field("y", "float64"), Field("z", "float64"))
 _FOLDED = {_XYZ: 3, (*_XYZ, Field("w", "float64")): 4}
@@ -181,7 +182,7 @@ def layout(definition: Definition, source: Source, little: bool = True) -> Layou
     """Lay out a message.
 
     Raises:
-        LayoutError: it has wide strings or more than 4096 fields, or its source does not hold it.
+        LayoutError: it has wide strings, more than 4096 fields or 4 MiB, or its source does not hold it.
     """
     return _Builder(definition, source, little).build()
 
@@ -287,6 +288,8 @@ class _Builder:
     def number(self, name: str, code: str, shape: tuple[int, ...] | None) -> None:
         base = np.dtype(self.order + code)
         count = 1 if shape is None else shape[0]
+        if count * base.itemsize > _MAX_BYTES - self.offset:
+            raise LayoutError(f"{name!r} makes the message too large for columns")
         if count:
             self.align(base.itemsize)
         if len(self.names) >= _MAX_LEAVES or name in self.names:

@@ -167,6 +167,14 @@ def test_both_byte_orders_give_the_same_columns(little: bool) -> None:
     assert packed.tobytes()[1] == int(little)
 
 
+@pytest.mark.parametrize(
+    "text", ["float64[4000000000] x", "Inner[4000000000] x\n====\nMSG: pkg/Inner\nint8 y"]
+)
+def test_a_definition_of_gigabytes_is_refused_at_once(text: str) -> None:
+    with pytest.raises(LayoutError, match="too (large|many)"):
+        layout_of_message(parse("pkg/msg/Huge", text), bytes([0, 1, 0, 0, 0, 0, 0, 0]))
+
+
 def test_a_stamp_beyond_2038_is_refused() -> None:
     definition = parse("sensor_msgs/msg/FluidPressure", definition_text("sensor_msgs/msg/FluidPressure"))
     fixed = layout(definition, Columns(np.dtype([]), {}))
