@@ -5,7 +5,7 @@ Simulated: JONSWAP, Pierson-Moskowitz and swell under the same raft. Vision: 20 
 ``ratio`` is the RMSE over that of the optimal predictor on the same windows, which knows the whole record's
 spectrum; ``vs mean`` over that of the window's mean; NEES is the squared error over the stated variance.
 
-    python benchmarks/heave.py [--windows 8] [--trials 24] [--span 60] [--json FILE]
+    python benchmarks/heave.py [--windows 12] [--trials 20] [--span 60] [--json FILE]
 """
 
 from __future__ import annotations
@@ -154,8 +154,8 @@ def targets(real: Cell) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
-    parser.add_argument("--windows", type=int, default=8, help="windows per real half-hour")
-    parser.add_argument("--trials", type=int, default=24, help="trials per simulated sea")
+    parser.add_argument("--windows", type=int, default=12, help="windows per real half-hour")
+    parser.add_argument("--trials", type=int, default=20, help="trials per simulated sea")
     parser.add_argument("--span", type=float, default=60.0, help="length of a window [s]")
     parser.add_argument("--sigma", type=float, default=0.03, help="noise of a fix [m]")
     parser.add_argument("--json", type=Path)

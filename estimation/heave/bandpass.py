@@ -64,12 +64,9 @@ class BandPass:
 
     def density(self, frequency_hz: Array) -> Array:
         """One-sided spectral density of the heave [m^2/Hz] at ``frequency_hz`` (m,)."""
-        total = np.zeros(len(frequency_hz))
-        identity = np.eye(self.size)
-        for k, hz in enumerate(np.asarray(frequency_hz, np.float64)):
-            gain = self.heave_row @ np.linalg.solve(2j * np.pi * hz * identity - self.f, self.l)
-            total[k] = 2.0 * float(np.sum(np.abs(gain) ** 2))
-        return total
+        s = 2j * np.pi * np.asarray(frequency_hz, np.float64)[:, None, None]
+        response = self.heave_row @ np.linalg.solve(s * np.eye(self.size) - self.f, self.l)
+        return np.asarray(2.0 * np.sum(np.abs(response) ** 2, axis=-1), np.float64)
 
     def autocovariance(self, lag_s: Array) -> Array:
         """Covariance of the heave with itself ``lag_s`` (m,) later [m^2]."""

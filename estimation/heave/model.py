@@ -85,6 +85,11 @@ class HeaveModel:
         return [Component(float(a), float(t), float(p)) for a, t, p in rows]
 
     @property
+    def noise_scale(self) -> float:
+        """Scatter of the samples over the sigma that they were given with; 1 where it was not learned."""
+        return self.learned.noise_scale if self.learned is not None else 1.0
+
+    @property
     def sd_m(self) -> float:
         """Standard deviation of the heave about its level [m]."""
         return math.sqrt(self.coefficients.variance_m2)
@@ -251,7 +256,7 @@ def fit(
         window.samples,
         window.dropped,
         coefficients,
-        window.noise_density_m2ps,
+        window.noise_density_m2ps * (learned.noise_scale**2 if learned is not None else 1.0),
         learned,
     )
 

@@ -6,10 +6,11 @@ the spectrum, plus a level and a slow drift (Bayesian harmonic regression). The 
     s(f) = (floor + J_1(f) + J_2(f)) exp(sum_k c_k B_k(f)),
 
 two JONSWAP-like peaks, each with its own peakedness and fall-off, times a smooth positive correction. All
-parameters and the drift's size are found together by maximising the exact marginal likelihood of the samples,
-with its gradient, under priors that hold the correction near one and the peaks near the shape of a wind sea
-on a small raft: the fewer the data, the closer the result stays to the parametric form. What is left
-uncertain of the spectrum enters the coefficients' covariance by the delta method.
+parameters and the sizes of drift and noise are found together by maximising the exact marginal likelihood of
+the samples, with its gradient, under priors that hold the correction near one and the peaks near the shape
+of a wind sea on a small raft: the fewer the data, the closer the result stays to the parametric form. What
+is left uncertain of the spectrum enters twice: its mean, not its mode, is taken, and the coefficients'
+covariance is widened by the delta method.
 
 The likelihood is evaluated in a compressed space: the samples are projected on the few hundred directions
 that the band can excite within the window.
@@ -53,6 +54,8 @@ class SpectrumSettings:
     drift_mps: float = 0.003
     """Median of the drift's prior size [m per root second]: 0.003 is 3 mm after 1 s, 9 mm after 10 s."""
     drift_log_sigma: float = 1.5
+    noise_log_sigma: float = 0.5
+    """1 sigma of the log of the true noise over the stated one."""
     iterations: int = 30
     warm_iterations: int = 12
 
@@ -62,7 +65,8 @@ class LearnedSpectrum:
     """A spectrum and the coefficients that it gives for one window.
 
     ``power_m2`` (m,) variance of each harmonic; ``mean`` (k,) and ``covariance`` (k, k) of all coefficients
-    of ``basis``; ``parameters`` for the next warm start; ``drift_mps`` [m per root second].
+    of ``basis``; ``parameters`` for the next warm start; ``drift_mps`` [m per root second]; ``noise_scale``
+    the samples' scatter over the sigma that they were given with.
     """
 
     basis: Basis
@@ -71,29 +75,40 @@ class LearnedSpectrum:
     covariance: Array
     parameters: Array
     drift_mps: float
+    noise_scale: float
     evaluations: int
 
 
 @dataclass(frozen=True, slots=True)
 class _Problem:
-    """The compressed regression: unit noise, columns U (r, k), data y (r,)."""
+    """The compressed regression: columns U (r, k), data y (r,), noise of one common variance.
+
+    ``outside`` directions of the data that no column reaches hold noise alone, ``outside_square`` their sum of
+    squares: they tell how large the noise really is.
+    """
 
     columns: Array
     data: Array
     harmonics: int
     level_variance: float
+    outside: int
+    outside_square: float
 
     def prior(self, power: Array, drift_variance: float) -> Array:
         drift = np.full(self.columns.shape[1] - 2 * self.harmonics - 1, drift_variance)
         return np.concatenate([power, power, [self.level_variance], drift])
 
-    def evidence(self, prior: Array) -> tuple[float, Array, Array, Array]:
-        """Negative log likelihood, gradient per prior variance (k,), whitened columns (r, k), U'K^-1 y."""
+    def evidence(self, prior: Array, noise: float) -> tuple[float, Array, float, Array, Array]:
+        """Likelihood of the prior variances (k,) and of the noise's variance, K = U S U' + noise I.
+
+        Returns the negative log likelihood, its gradient per prior variance (k,) and by the log of the noise's
+        variance, the whitened columns L^-1 U (r, k), and U' K^-1 y (k,).
+        """
         from scipy.linalg import blas, lapack
 
         u = self.columns
         k = blas.dsyrk(1.0, u * np.sqrt(prior), lower=1)
-        k[np.diag_indices_from(k)] += 1.0
+        k[np.diag_indices_from(k)] += noise
         lower, info = lapack.dpotrf(k, lower=1, overwrite_a=1)
         if info:
             raise np.linalg.LinAlgError("the covariance of the heave samples is not positive definite")
@@ -101,28 +116,32 @@ class _Problem:
         value = 0.5 * float(self.data @ solved) + float(np.log(np.diag(lower)).sum())
         whitened = blas.dtrsm(1.0, lower, u, lower=1)
         score = u.T @ solved
-        return value, 0.5 * (np.einsum("ij,ij->j", whitened, whitened) - score**2), whitened, score
+        power = np.einsum("ij,ij->j", whitened, whitened)
+        value += 0.5 * (self.outside * math.log(noise) + self.outside_square / noise)
+        explained = len(solved) - float(prior @ power) - noise * float(solved @ solved)
+        by_noise = 0.5 * (explained + self.outside - self.outside_square / noise)
+        return value, 0.5 * (power - score**2), by_noise, whitened, score
 
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """The spectrum as a function of its parameters [peaks, log drift variance, correction]."""
+    """The spectrum as a function of its parameters [peaks, log drift and noise variance, correction]."""
 
     frequency: Array
     bumps: Array
     floor: float
 
     def __call__(self, x: Array) -> tuple[Array, Array]:
-        """Power (m,) and its derivative by each parameter (p, m); zero by the drift's."""
+        """Power (m,) and its derivative by each parameter (p, m); zero by those of drift and noise."""
         total, rows = np.full(len(self.frequency), self.floor), []
         for k in range(PEAKS):
             value, derivative = _peak(self.frequency, x[4 * k : 4 * k + 4])
             total = total + value
             rows.append(derivative)
-        correction = np.exp(self.bumps @ x[4 * PEAKS + 1 :])
+        correction = np.exp(self.bumps @ x[4 * PEAKS + 2 :])
         power = total * correction
         peaks = np.concatenate(rows) * correction
-        return power, np.vstack([peaks, np.zeros((1, len(power))), (self.bumps * power[:, None]).T])
+        return power, np.vstack([peaks, np.zeros((2, len(power))), (self.bumps * power[:, None]).T])
 
 
 def _peak(frequency: Array, p: Array) -> tuple[Array, Array]:
@@ -159,35 +178,36 @@ def learn(
     first, top = _first_guess(window, basis, settings)
     shape = _Shape(basis.frequency_hz, bumps, settings.floor * math.exp(top))
     log_drift = 2.0 * math.log(settings.drift_mps)
-    centre = np.concatenate([np.tile(PEAK_MEAN, PEAKS), [log_drift], np.zeros(bumps.shape[1])])
+    centre = np.concatenate([np.tile(PEAK_MEAN, PEAKS), [log_drift, 0.0], np.zeros(bumps.shape[1])])
     sigma = np.concatenate(
         [
             np.tile(PEAK_SIGMA, PEAKS),
-            [2.0 * settings.drift_log_sigma],
+            [2.0 * settings.drift_log_sigma, 2.0 * settings.noise_log_sigma],
             np.full(bumps.shape[1], settings.correction_sigma),
         ]
     )
     where = 4 * PEAKS
     band = (math.log(settings.lowest_hz), math.log(basis.frequency_hz[-1]))
     bounds = [(top - 8.0, top + 3.0), band, (0.0, 2.0), (3.0, 14.0)] * PEAKS
-    bounds += [(-16.0, 0.0)] + [(-4.0, 4.0)] * bumps.shape[1]
+    bounds += [(-16.0, 0.0), (-8.0, 8.0)] + [(-4.0, 4.0)] * bumps.shape[1]
     low, high = np.array(bounds).T
 
     def objective(x: Array) -> tuple[float, Array]:
         power, derivative = shape(x)
         prior = problem.prior(power, math.exp(x[where]))
-        value, slope, _, _ = problem.evidence(prior)
+        value, slope, by_noise, _, _ = problem.evidence(prior, math.exp(x[where + 1]))
         m = len(power)
         gradient = derivative @ (slope[:m] + slope[m : 2 * m])
         gradient[where] = slope[2 * m + 1 :] @ prior[2 * m + 1 :]
+        gradient[where + 1] = by_noise
         z = (x - centre) / sigma
         return value + 0.5 * float(z @ z), gradient + z / sigma
 
-    start = np.clip(np.concatenate([first, [log_drift], np.zeros(bumps.shape[1])]), low, high)
+    start = np.clip(np.concatenate([first, [log_drift, 0.0], np.zeros(bumps.shape[1])]), low, high)
     iterations = settings.iterations
     if previous is not None:
         same = previous.parameters.shape == start.shape
-        warm = previous.parameters if same else np.append(previous.parameters[: where + 1], 0.0 * bumps[0])
+        warm = previous.parameters if same else np.append(previous.parameters[: where + 2], 0.0 * bumps[0])
         warm = np.clip(warm, low, high)
         if objective(warm)[0] < objective(start)[0]:
             start = warm
@@ -197,8 +217,14 @@ def learn(
     )
     x: Array = found.x
     power, derivative = shape(x)
-    mean, covariance = _posterior(problem, power, derivative, math.exp(x[where]), sigma, where)
-    return LearnedSpectrum(basis, power, mean, covariance, x, math.exp(0.5 * x[where]), int(found.nfev))
+    uncertain = _log_covariance(problem, power, derivative, x, sigma, where)
+    by_parameter = derivative / power
+    spread = np.einsum("ij,ij->j", by_parameter, uncertain @ by_parameter)
+    power = power * np.exp(0.5 * np.minimum(spread, 1.0))
+    derivative = by_parameter * power
+    mean, covariance = _posterior(problem, power, derivative, x, uncertain, where)
+    drift, scale = (math.exp(0.5 * value) for value in x[where : where + 2])
+    return LearnedSpectrum(basis, power, mean, covariance, x, drift, scale, int(found.nfev))
 
 
 def _compress(window: Window, basis: Basis, settings: SpectrumSettings) -> _Problem:
@@ -209,10 +235,15 @@ def _compress(window: Window, basis: Basis, settings: SpectrumSettings) -> _Prob
     frame = Basis(frequency[1:]).values(window.time_s)
     columns = weight * basis.values(window.time_s)
     data = weight[:, 0] * window.value_m
+    outside, square = 0, 0.0
     if frame.shape[1] < frame.shape[0]:
         q, _ = np.linalg.qr(weight * frame)
-        columns, data = q.T @ columns, q.T @ data
-    return _Problem(np.asfortranarray(columns), data, len(basis.frequency_hz), settings.level_sigma_m**2)
+        inside = q.T @ data
+        outside, square = len(data) - len(inside), float(data @ data - inside @ inside)
+        columns, data = q.T @ columns, inside
+    columns = np.asfortranarray(columns)
+    level_variance = settings.level_sigma_m**2
+    return _Problem(columns, data, len(basis.frequency_hz), level_variance, outside, max(0.0, square))
 
 
 def _bumps(frequency: Array, span_s: float, settings: SpectrumSettings) -> Array:
@@ -249,25 +280,45 @@ def _first_guess(window: Window, basis: Basis, settings: SpectrumSettings) -> tu
     return np.array(first + second), top
 
 
-def _posterior(
-    problem: _Problem, power: Array, derivative: Array, drift_variance: float, sigma: Array, where: int
-) -> tuple[Array, Array]:
-    """Mean (k,) and covariance (k, k) of the coefficients, the spectrum's own uncertainty included.
+def _log_covariance(
+    problem: _Problem, power: Array, derivative: Array, x: Array, sigma: Array, where: int
+) -> Array:
+    """Covariance of the parameters (p, p): the inverse of Fisher's information plus the prior's.
 
-    With S the prior variances, W = U' K^-1 U and g = U' K^-1 y the mean is S g and the covariance S - S W S.
-    The parameters' covariance is the inverse of Fisher's information 1/2 D (W o W) D' plus their prior; it
-    enters through the mean's derivative by them (the empirical-Bayes correction of Kass and Steffey, 1989).
+    The information on the variances of the coefficients is 1/2 W o W with W = U' K^-1 U.
     """
-    prior = problem.prior(power, drift_variance)
-    _, _, whitened, score = problem.evidence(prior)
+    prior = problem.prior(power, math.exp(x[where]))
+    _, _, _, whitened, _ = problem.evidence(prior, math.exp(x[where + 1]))
     w = whitened.T @ whitened
-    m = len(power)
+    full = _by_coefficient(prior, derivative, where)
+    information = 0.5 * full @ (w * w) @ full.T + np.diag(1.0 / sigma**2)
+    covariance = np.linalg.inv(information)
+    return np.asarray(0.5 * (covariance + covariance.T), np.float64)
+
+
+def _by_coefficient(prior: Array, derivative: Array, where: int) -> Array:
+    """Derivatives of the coefficients' variances by the parameters (p, k), drift included."""
+    m = derivative.shape[1]
     full = np.zeros((len(derivative), len(prior)))
     full[:, :m] = full[:, m : 2 * m] = derivative
     full[where, 2 * m + 1 :] = prior[2 * m + 1 :]
-    information = 0.5 * full @ (w * w) @ full.T + np.diag(1.0 / sigma**2)
-    moved = full * score
+    return full
+
+
+def _posterior(
+    problem: _Problem, power: Array, derivative: Array, x: Array, uncertain: Array, where: int
+) -> tuple[Array, Array]:
+    """Mean (k,) and covariance (k, k) of the coefficients, the spectrum's own uncertainty included.
+
+    With S the prior variances, W = U' K^-1 U and g = U' K^-1 y the mean is S g and the covariance S - S W S. The
+    covariance ``uncertain`` (p, p) of the parameters enters through the mean's derivative by them (the
+    empirical-Bayes correction of Kass and Steffey, 1989).
+    """
+    prior = problem.prior(power, math.exp(x[where]))
+    _, _, _, whitened, score = problem.evidence(prior, math.exp(x[where + 1]))
+    w = whitened.T @ whitened
+    moved = _by_coefficient(prior, derivative, where) * score
     by_parameter = moved - (moved @ w) * prior
     covariance = np.diag(prior) - (prior[:, None] * w) * prior
-    covariance += by_parameter.T @ np.linalg.solve(information, by_parameter)
+    covariance += by_parameter.T @ uncertain @ by_parameter
     return prior * score, 0.5 * (covariance + covariance.T)
