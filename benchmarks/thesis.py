@@ -328,6 +328,15 @@ def show(name: str, result: dict[str, Any]) -> None:
         print(f"the thesis states: {stated}")
 
 
+def without_nan(value: Any) -> Any:
+    """Return the results with null for what was not measured: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {key: without_nan(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [without_nan(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -340,7 +349,11 @@ def main() -> None:
         show(name, result)
         results[name] = result
     if arguments.json:
-        record = {"benchmark": "thesis", "draws": 2 if arguments.quick else 10, "results": results}
+        record = {
+            "benchmark": "thesis",
+            "draws": 2 if arguments.quick else 10,
+            "results": without_nan(results),
+        }
         Path(arguments.json).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
