@@ -17,6 +17,7 @@ from typing import Any
 import click
 
 from deckfix._version import __version__
+from deckfix.cli_detect import detect
 from deckfix.cli_vision import calibrate, target
 
 _ENGINE = click.option(
@@ -187,6 +188,7 @@ def demo(output: str, seed: int, force: bool) -> None:
     _say(run_demo(output, seed=seed, force=force))
 
 
+deckfix.add_command(detect)
 deckfix.add_command(target)
 deckfix.add_command(calibrate)
 
@@ -255,8 +257,9 @@ def _fail(message: str, code: int) -> int:
 
 
 def _one_line(message: str) -> str:
-    line = " ".join(message.split())
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+    from deckfix.terminal import printable
+
+    return printable(" ".join(message.split()))
 
 
 def _stop_on_termination() -> None:

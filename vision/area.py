@@ -1,9 +1,9 @@
 """The photometric fit of a target so small that its edges run into each other.
 
-All pixels of the target are compared with the sum of its blurred edges (``vision.refine`` has the model); light and
-its gradient, and the brightness of what surrounds the outermost edge, are eliminated linearly. Several scales are
-tried, because a blob says little about which of its edges it shows, and a plain disc of the same size must fit
-clearly worse.
+All pixels of the target are compared with the sum of its blurred edges (``vision.refine`` has the model);
+light and its gradient, and the brightness of what surrounds the outermost edge, are eliminated linearly.
+Several scales are tried, because a blob says little about which of its edges it shows, and a plain disc of
+the same size must fit clearly worse.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ class _Patch:
             return self
         # A step that shares no factor with the rows' length would leave stripes; a fixed shuffle does not.
         pick = np.sort(np.random.default_rng(len(self.u)).permutation(len(self.u))[: len(self.u) // step])
-        return _Patch(self.u[pick], self.v[pick], self.x[pick], self.y[pick], self.value[pick], self.red[pick])
+        return _Patch(
+            self.u[pick], self.v[pick], self.x[pick], self.y[pick], self.value[pick], self.red[pick]
+        )
 
 
 def _patch(image: Image, plane: LevelPlane, centre: Array, radius: float, border_px: float) -> _Patch | None:
@@ -105,8 +107,9 @@ def fit_area(
 ) -> Fit | None:
     """Fit the whole target at once; parameters and result as in ``fit_profiles``.
 
-    ``margin_m`` is the width of white around the outermost edge [m]. With ``sectors`` above one each sector has its
-    own light, and pixels that disagree lose their weight: for shadows, glare and things in front of the target.
+    ``margin_m`` is the width of white around the outermost edge [m]. With ``sectors`` above one each sector
+    has its own light, and pixels that disagree lose their weight: for shadows, glare and things in front of
+    the target.
     """
     unit = float(plane.units_per_pixel(centre[0], centre[1]))
     patch = _patch(image, plane, centre, kappa * edges_m[0] * max(scales), 4.0)
@@ -143,7 +146,8 @@ def fit_area(
 
 @dataclass(slots=True)
 class _Model:
-    """The equations of one patch. ``fixed_pixels`` and ``fixed_weight`` replace the choice of pixels, if given."""
+    """The equations of one patch. ``fixed_pixels`` and ``fixed_weight`` replace the choice of pixels, if
+    given."""
 
     patch: _Patch
     edges_m: Array
@@ -160,7 +164,7 @@ class _Model:
         plane, kappa, blur = state.plane, state.kappa, state.blur_px
         white_px = max(kappa * self.margin_m / self.unit - 1.2, 0.8)
         reach = kappa * edges_m[0] + min(3.0, white_px) * self.unit
-        qx, qy = plane.from_rays(patch.x, patch.y, patch.v)
+        qx, qy = plane.from_rays(patch.x, patch.y, patch.v.astype(np.float64))
         ex, ey = qx - state.centre[0], qy - state.centre[1]
         rho = np.sqrt(ex * ex + ey * ey)
         used = rho < reach if self.fixed_pixels is None else self.fixed_pixels
@@ -240,11 +244,14 @@ class _Model:
         )
 
     def _light(self, ex: Array, ey: Array, cdf: Array) -> Array:
-        """Return the columns of everything that is linear: levels, contrasts, and how they vary over the target."""
+        """Return the columns of everything that is linear: levels, contrasts, and how they vary over the
+        target."""
         pattern = cdf.sum(axis=1)
         outermost = cdf[:, 0] if cdf.shape[1] > 1 else np.zeros_like(ex)
         if self.sectors == 1:
-            return np.stack((np.ones_like(ex), pattern, outermost, ex, ey, ex * pattern, ey * pattern), axis=1)
+            return np.stack(
+                (np.ones_like(ex), pattern, outermost, ex, ey, ex * pattern, ey * pattern), axis=1
+            )
         sector = ((np.arctan2(ey, ex) / (2.0 * np.pi) % 1.0) * self.sectors).astype(np.intp) % self.sectors
         one_hot = np.zeros((len(ex), self.sectors))
         one_hot[np.arange(len(ex)), sector] = 1.0
@@ -257,7 +264,7 @@ class _Model:
         scale = 0.5
         for _ in range(1 if self.fixed_weight is not None else 3):
             lw = linear * weight[:, None]
-            coefficients = np.linalg.solve(lw.T @ linear + np.diag(ridge), lw.T @ value)
+            coefficients: Array = np.linalg.solve(lw.T @ linear + np.diag(ridge), lw.T @ value)
             rest = value - linear @ coefficients
             if self.fixed_weight is not None:
                 break
@@ -325,7 +332,7 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
     considered = np.zeros((5, 3))
     considered[rows] = shift[at]
     agrees = np.abs(solved.residual) < max(3.5 * np.sqrt(variance), 0.12 * solved.contrast)
-    u, v = patch.u[solved.used], patch.v[solved.used]
+    v = patch.v[solved.used]
     qx, qy = state.plane.from_rays(patch.x[solved.used], patch.y[solved.used], v.astype(np.float64))
     ex, ey = qx - state.centre[0], qy - state.centre[1]
     inside = agrees & (np.hypot(ex, ey) < 0.97 * state.kappa * edges_m[0])

@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 def plane_rotations(x: Array, y: Array, max_rms: float) -> list[Array]:
     """Return the rotations (camera to plane axes, (3, 3)) of the planes in which rays (x, y) form a circle.
 
-    ``x``, ``y`` (n,) are undistorted rays of points on one circle. The cone through them is cut in circles by two
-    families of planes (eigenvectors of its matrix); those that face the camera are returned, none where the points
-    are no ellipse to ``max_rms`` (in units of rays).
+    ``x``, ``y`` (n,) are undistorted rays of points on one circle. The cone through them is cut in circles
+    by two families of planes (eigenvectors of its matrix); those that face the camera are returned, none
+    where the points are no ellipse to ``max_rms`` (in units of rays).
     """
     conic = fit_conic(x, y)
     if conic is None:

@@ -1,8 +1,8 @@
 """The level plane: rays of pixels cut with the plane one metre along the level frame's third axis.
 
-For a camera attitude ``R`` (camera to level axes; ``R_nc`` for a level target) a pixel's ray ``d = R (x, y, 1)``
-meets that plane in ``q = (d_x / d_z, d_y / d_z)``. A target that lies parallel to it at height ``h`` appears there
-to scale: its circles are circles, concentric, of radius ``r / h``.
+For a camera attitude ``R`` (camera to level axes; ``R_nc`` for a level target) a pixel's ray ``d = R (x, y,
+1)`` meets that plane in ``q = (d_x / d_z, d_y / d_z)``. A target that lies parallel to it at height ``h``
+appears there to scale: its circles are circles, concentric, of radius ``r / h``.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ HORIZON = 0.05
 class LevelPlane:
     """Maps pixels to the level plane and back.
 
-    ``rotation`` (3, 3) takes camera axes to level axes. ``rate_cam_radps`` (3,) is the camera's angular velocity in
-    its own axes: with a rolling shutter each row's ray is turned to the time of the middle row.
+    ``rotation`` (3, 3) takes camera axes to level axes. ``rate_cam_radps`` (3,) is the camera's angular
+    velocity in its own axes: with a rolling shutter each row's ray is turned to the time of the middle row.
     """
 
     camera: Camera
@@ -152,8 +152,8 @@ def rotation_to_level(normal: Array) -> Array:
 def rotation_vector_xy(rotation: Array) -> Array:
     """Return the rotation vector's first two entries (2,) of a rotation about an axis in the level plane.
 
-    Of a general rotation it is the part that turns the third axis. Law: ``rotation_vector_xy(rotation_xy(a, b))``
-    is (a, b) for angles below pi.
+    Of a general rotation it is the part that turns the third axis. Law: ``rotation_vector_xy(rotation_xy(a,
+    b))`` is (a, b) for angles below pi.
     """
     axis = np.array([-rotation[1, 2], rotation[0, 2]])
     sine = float(np.hypot(axis[0], axis[1]))

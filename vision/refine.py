@@ -2,17 +2,18 @@
 
 Nothing is interpolated: integer pixels are compared, through their exact rays, with the model
 
-    I = a + b * sum_k s_k * Phi((rho - rho_k) / sigma)      rho_k = kappa r_k - sigma^2 / (2 kappa r_k) + s_k g
+    I = a + b * sum_k s_k * Phi((rho - rho_k) / sigma)      rho_k = kappa r_k - sigma^2 / (2 kappa r_k) +
+    s_k g
 
-where rho is the pixel's distance from the centre in the level plane, s_k = +1 for the outside of red and -1 for the
-edge of a hole, sigma the blur, and g the *growth* of red: whatever moves both edges of a ring apart (white that
-clips, gamma, ink that bleeds) moves them by the same pixels, so that it is estimated instead of biasing the scale.
-sigma^2 / (2 R) is the inward shift of a blurred edge of radius R.
+where rho is the pixel's distance from the centre in the level plane, s_k = +1 for the outside of red and -1
+for the edge of a hole, sigma the blur, and g the *growth* of red: whatever moves both edges of a ring apart
+(white that clips, gamma, ink that bleeds) moves them by the same pixels, so that it is estimated instead of
+biasing the scale. sigma^2 / (2 R) is the inward shift of a blurred edge of radius R.
 
-``fit_profiles`` does this on lines of pixels across single edges. Every line has its own a and b (light, shadow and
-glare need no model) and yields the edge's displacement; the displacements give the geometry by weighted least
-squares, and their scatter about it, not the pixel noise, gives the covariance. ``fit_area`` does it on all pixels of
-a target so small that its edges run into each other.
+``fit_profiles`` does this on lines of pixels across single edges. Every line has its own a and b (light,
+shadow and glare need no model) and yields the edge's displacement; the displacements give the geometry by
+weighted least squares, and their scatter about it, not the pixel noise, gives the covariance. ``fit_area``
+does it on all pixels of a target so small that its edges run into each other.
 """
 
 from __future__ import annotations
@@ -43,15 +44,16 @@ class Fit:
     """The result of a photometric fit.
 
     ``plane`` is the plane that was fitted, tilted where the tilt was free; ``centre`` (2,), ``kappa`` [1/m];
-    ``tilt`` (2,) rotation vector about the level x and y axes [rad]; ``information_inverse`` the covariance of
-    (centre x, y, kappa, tilt x, y), shape (5, 5), zero rows for a fixed tilt; ``considered`` (5, 3) the change of
-    those per relative error of the focal length and per pixel of the principal point; ``residual_px`` the
-    root-mean-square displacement of the edges; ``share`` of the visible edge length that agrees with the model;
-    ``edges`` that were seen, of ``n_visible`` that should be; ``chi2`` the mean weighted square of the displacements
-    (of an area fit: how many times worse a plain disc fits); ``points_px`` (n, 2) what was compared, and whether it
-    ``agrees``. ``red_slope`` is the change of R per change of (G + B) / 2: about zero or positive between red and
-    white, about -1 between red and blue. ``contradicted`` is the share of the places where an edge should be and
-    plain white is, or (of an area fit) what disagrees evenly all round.
+    ``tilt`` (2,) rotation vector about the level x and y axes [rad]; ``information_inverse`` the covariance
+    of (centre x, y, kappa, tilt x, y), shape (5, 5), zero rows for a fixed tilt; ``considered`` (5, 3) the
+    change of those per relative error of the focal length and per pixel of the principal point;
+    ``residual_px`` the root-mean-square displacement of the edges; ``share`` of the visible edge length
+    that agrees with the model; ``edges`` that were seen, of ``n_visible`` that should be; ``chi2`` the mean
+    weighted square of the displacements (of an area fit: how many times worse a plain disc fits);
+    ``points_px`` (n, 2) what was compared, and whether it ``agrees``. ``red_slope`` is the change of R per
+    change of (G + B) / 2: about zero or positive between red and white, about -1 between red and blue.
+    ``contradicted`` is the share of the places where an edge should be and plain white is, or (of an area
+    fit) what disagrees evenly all round.
     """
 
     plane: LevelPlane
@@ -78,8 +80,8 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class _Lines:
-    """Lines of pixels across edges: rays ``x``, ``y``, rows ``v``, ``weight`` and ``value`` less its mean (p, m);
-    the rest (p,)."""
+    """Lines of pixels across edges: rays ``x``, ``y``, rows ``v``, ``weight`` and ``value`` less its mean
+    (p, m); the rest (p,)."""
 
     x: Array
     y: Array
@@ -101,7 +103,8 @@ def edge_sides(n_edges: int) -> Array:
 
 
 def edge_gaps(edges_m: Array) -> Array:
-    """Return the distance of each edge to its nearest neighbour (or, for the innermost, to the centre) [m]."""
+    """Return the distance of each edge to its nearest neighbour (or, for the innermost, to the centre)
+    [m]."""
     steps = -np.diff(edges_m)
     return np.minimum(np.concatenate(([np.inf], steps)), np.concatenate((steps, [2.0 * edges_m[-1]])))
 
@@ -208,10 +211,11 @@ def fit_profiles(
     iterations: int = 5,
     start_blur_px: float = 0.7,
 ) -> Fit | None:
-    """Fit centre, scale, blur and growth (and the plane's tilt, with a prior of ``tilt_sigma_rad``, if not zero).
+    """Fit centre, scale, blur and growth (and the plane's tilt, with a prior of ``tilt_sigma_rad``, if not
+    zero).
 
-    ``image`` BGR; ``centre`` (2,), ``kappa`` [1/m] the start, good to about 1.5 px at the edges. None where too few
-    edges are in view or the fit leaves the start.
+    ``image`` BGR; ``centre`` (2,), ``kappa`` [1/m] the start, good to about 1.5 px at the edges. None where
+    too few edges are in view or the fit leaves the start.
     """
     lines = sample_lines(image, plane, centre, kappa, edges_m, 4.0, n_lines)
     if lines is None:
@@ -410,7 +414,8 @@ def _step(
 
 
 def _solve3(gram: Array) -> tuple[Array, Array]:
-    """Solve the 3x3 systems ``gram[:, :3, :3] x = gram[:, :3, 3]``; also return element (1, 1) of the inverse."""
+    """Solve the 3x3 systems ``gram[:, :3, :3] x = gram[:, :3, 3]``; also return element (1, 1) of the
+    inverse."""
     a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 0, 2]
     d, e, f = gram[:, 1, 1], gram[:, 1, 2], gram[:, 2, 2] * 1.05 + 1e-12
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d

@@ -1,14 +1,14 @@
 """From an image to hypotheses about the target: red mask, contours, circles in the level plane, ring labels.
 
-With a known attitude every pixel's ray is turned into the level frame and cut with the plane one metre below the
-camera: ``q = (d_x / d_z, d_y / d_z)``. There the target's edges are exact, concentric circles of radius
-``r_k * kappa`` about ``c = (X / h, Y / h)`` with ``kappa = 1 / h``, whatever the camera's roll and pitch were; the
-perspective bias of ellipse centres and the foreshortening of seed 4.2 do not arise.
+With a known attitude every pixel's ray is turned into the level frame and cut with the plane one metre
+below the camera: ``q = (d_x / d_z, d_y / d_z)``. There the target's edges are exact, concentric circles of
+radius ``r_k * kappa`` about ``c = (X / h, Y / h)`` with ``kappa = 1 / h``, whatever the camera's roll and
+pitch were; the perspective bias of ellipse centres and the foreshortening of seed 4.2 do not arise.
 
-Two ways lead to a hypothesis. ``identify_circles`` takes whole contours as circles and labels them by their ratio
-of radii and by their type (outside of red, or edge of a hole). ``identify_votes`` takes single boundary points with
-their normals, which pass through the common centre, and so works where every ring is cut by the frame, a bar or a
-shadow. Both return several hypotheses, best first; the photometric fit decides.
+Two ways lead to a hypothesis. ``identify_circles`` takes whole contours as circles and labels them by their
+ratio of radii and by their type (outside of red, or edge of a hole). ``identify_votes`` takes single
+boundary points with their normals, which pass through the common centre, and so works where every ring is
+cut by the frame, a bar or a shadow. Both return several hypotheses, best first; the photometric fit decides.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ IntArray = NDArray[np.int64]
 Image = NDArray[np.uint8]
 
 CONTOUR_INSET_PX = 0.45
-"""How far inside the red region a contour point lies, in pixels of the mask (half a pixel less the threshold's
-overshoot: a ratio threshold of 1.3 trips at 38 % red)."""
+"""How far inside the red region a contour point lies, in pixels of the mask (half a pixel less the
+threshold's overshoot: a ratio threshold of 1.3 trips at 38 % red)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contours:
     """Boundary points of red regions.
 
-    ``u``, ``v`` (n,) full-resolution pixel coordinates; contour ``i`` is ``start[i]:start[i + 1]``; ``hole`` (m,)
-    tells the edge of a hole from an outside edge; ``step_px`` is the size of a mask pixel in image pixels.
+    ``u``, ``v`` (n,) full-resolution pixel coordinates; contour ``i`` is ``start[i]:start[i + 1]``;
+    ``hole`` (m,) tells the edge of a hole from an outside edge; ``step_px`` is the size of a mask pixel in
+    image pixels.
     """
 
     u: Array
@@ -53,8 +54,9 @@ class Contours:
 class Hypothesis:
     """A place and scale of the target in the level plane.
 
-    ``centre`` (2,) and ``kappa`` [1/m] give edge ``k`` the circle ``|q - centre| = kappa * r_k``; ``edges`` are the
-    labels that support it; ``score`` is comparable within one image (share of the expected boundary that was found).
+    ``centre`` (2,) and ``kappa`` [1/m] give edge ``k`` the circle ``|q - centre| = kappa * r_k``; ``edges``
+    are the labels that support it; ``score`` is comparable within one image (share of the expected boundary
+    that was found).
     """
 
     centre: Array
@@ -64,7 +66,8 @@ class Hypothesis:
 
 
 def halve(image: Image) -> Image:
-    """Return the image averaged over blocks of 2x2 pixels; block (i, j) is centred at (2 j + 0.5, 2 i + 0.5)."""
+    """Return the image averaged over blocks of 2x2 pixels; block (i, j) is centred at (2 j + 0.5, 2 i +
+    0.5)."""
     height, width = image.shape[:2]
     even = image[: height - height % 2, : width - width % 2]
     return np.asarray(cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
@@ -103,8 +106,8 @@ class Circles:
 def fit_circles(qx: Array, qy: Array, start: IntArray) -> Circles:
     """Fit a circle to each run of points by linear least squares (Kasa), all runs at once.
 
-    ``qx``, ``qy`` (n,); run ``i`` is ``start[i]:start[i + 1]``. The radius is the mean distance from the centre,
-    the spread the standard deviation of that distance.
+    ``qx``, ``qy`` (n,); run ``i`` is ``start[i]:start[i + 1]``. The radius is the mean distance from the
+    centre, the spread the standard deviation of that distance.
     """
     first = start[:-1]
     count = np.diff(start)
@@ -131,9 +134,9 @@ def identify_circles(
 ) -> list[Hypothesis]:
     """Label whole contours as edges of the target and return hypotheses, best first.
 
-    Every contour that is a circle to within ``tolerance`` of its radius (plus a pixel) is tried as every edge of
-    its type; the other circles about the same centre then have to lie at that scale's radii. A single small disc is
-    offered as the outermost edge, with a low score.
+    Every contour that is a circle to within ``tolerance`` of its radius (plus a pixel) is tried as every
+    edge of its type; the other circles about the same centre then have to lie at that scale's radii. A
+    single small disc is offered as the outermost edge, with a low score.
     """
     if not len(contours):
         return []
@@ -183,7 +186,8 @@ def _label(
     match = (error < 0.035 * radius[None, :] + slack) & (apart < 0.12 * radius[None, :] + 1.5 * slack)
     weight = np.where(match, count[None, :] * unit[None, :], 0.0)
     support = weight.sum(axis=1)
-    # The support that a complete target would have: circumference of the edges that are large enough to be traced.
+    # The support that a complete target would have: circumference of the edges that are large enough to be
+    # traced.
     visible = predicted > 1.5 * unit[trial_circle][:, None]
     expected = 2.0 * np.pi * (predicted * visible).sum(axis=1) + 1e-12
     n_matched = match.sum(axis=1)
@@ -221,9 +225,10 @@ def identify_votes(
 ) -> list[Hypothesis]:
     """Find the common centre of arcs, then the scale, from single boundary points and their normals.
 
-    For targets of which no ring is whole: cut by the image's border, a bar, a shadow's edge or glare. Pairs of
-    normals vote for centres; along the radius the signed edges (outside of red, edge of a hole) are matched with the
-    target's for every scale. The draw of pairs is fixed, so that equal images give equal answers.
+    For targets of which no ring is whole: cut by the image's border, a bar, a shadow's edge or glare. Pairs
+    of normals vote for centres; along the radius the signed edges (outside of red, edge of a hole) are
+    matched with the target's for every scale. The draw of pairs is fixed, so that equal images give equal
+    answers.
     """
     points = _boundary_points(contours, plane)
     if points is None:
@@ -247,7 +252,8 @@ def identify_votes(
 def _boundary_points(
     contours: Contours, plane: LevelPlane, max_points: int = 900
 ) -> tuple[Array, Array, Array] | None:
-    """Return points in the level plane (n, 2), unit normals from red to not red (n, 2), and the mask's pixel (n,)."""
+    """Return points in the level plane (n, 2), unit normals from red to not red (n, 2), and the mask's
+    pixel (n,)."""
     count = np.diff(contours.start)
     if not len(count) or count.max() < 16:
         return None
