@@ -171,7 +171,7 @@ def test_both_byte_orders_give_the_same_columns(little: bool) -> None:
     "text", ["float64[4000000000] x", "Inner[4000000000] x\n====\nMSG: pkg/Inner\nint8 y"]
 )
 def test_a_definition_of_gigabytes_is_refused_at_once(text: str) -> None:
-    with pytest.raises(LayoutError, match="too (large|many)"):
+    with pytest.raises(LayoutError, match=r"too (large|many)"):
         layout_of_message(parse("pkg/msg/Huge", text), bytes([0, 1, 0, 0, 0, 0, 0, 0]))
 
 
