@@ -12,6 +12,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from logs.ardupilot import filter_delay
 from logs.companion import read_companion
@@ -30,6 +31,7 @@ from logs.sensors import (
     RTK_FLOAT,
     WARN,
     Floats,
+    Stamps,
     attitude_series,
     barometer_series,
     columns,
@@ -47,6 +49,7 @@ from logs.vehicles import IMU_MESSAGES, Autopilot, find_autopilot
 
 _STANDARD_GRAVITY = 9.80665
 _DOWNWARD = 25
+_HOLD_NS = 200_000_000
 _ARDUPILOT = 3
 _UNKNOWN_COURSE = 65535
 _SPEED_SIGMA_MPS = 0.5
@@ -124,7 +127,7 @@ def _imu(autopilot: Autopilot, ardupilot: bool, delay: dict[str, str]) -> list[S
             continue
         made = [imu_series(times, rate, acceleration, 0, {"message": name, **delay})]
         if np.any(field):
-            fresh = _changes(field)
+            fresh = _changes(field, times.stamp_ns)
             made.append(magnetometer_series(times[fresh], field[fresh], 0, {"message": name}))
         if (
             name == "HIGHRES_IMU"
@@ -132,7 +135,7 @@ def _imu(autopilot: Autopilot, ardupilot: bool, delay: dict[str, str]) -> list[S
             and data["abs_pressure"].any()
         ):
             pressure = 100.0 * data["abs_pressure"].astype(np.float64)
-            fresh = _changes(pressure[:, np.newaxis])
+            fresh = _changes(pressure[:, np.newaxis], times.stamp_ns)
             made += barometer_series(
                 times[fresh], pressure[fresh], data["temperature"][fresh], 0, {"message": name}
             )
@@ -148,11 +151,18 @@ def _gauss(field: Floats) -> float:
     return 1e-4 * 10.0 ** (-3 * round(math.log10(strength / 0.5) / 3))
 
 
-def _changes(values: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return which rows (n, k) differ from the row before: a slow sensor's values are sent several times."""
-    fresh = np.ones(len(values), dtype=np.bool_)
-    fresh[1:] = np.any(values[1:] != values[:-1], axis=1)
-    return fresh
+def _changes(values: Floats, stamp_ns: Stamps) -> NDArray[np.bool_]:
+    """Return which rows (n, k) to keep of a slow sensor, whose values are sent several times.
+
+    Kept are those that differ from the row before, and of rows that stay equal one every 0.2 s.
+    """
+    changed = np.ones(len(values), dtype=np.bool_)
+    changed[1:] = np.any(values[1:] != values[:-1], axis=1)
+    since = np.maximum.accumulate(np.where(changed, np.arange(len(values)), 0))
+    waits = (stamp_ns - stamp_ns[since]) // _HOLD_NS
+    keep = changed.copy()
+    keep[1:] |= waits[1:] > waits[:-1]
+    return keep
 
 
 def _undulation(autopilot: Autopilot) -> float | None:
@@ -210,7 +220,7 @@ def _air(autopilot: Autopilot) -> list[Series]:
     if found is None:
         return []
     data, times = found
-    fresh = _changes(data["press_abs"][:, np.newaxis])
+    fresh = _changes(data["press_abs"][:, np.newaxis], times.stamp_ns)
     data, times = data[fresh], times[fresh]
     pressure = 100.0 * data["press_abs"].astype(np.float64)
     return barometer_series(times, pressure, 1e-2 * data["temperature"], 0, {"message": "SCALED_PRESSURE"})

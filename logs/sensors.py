@@ -66,7 +66,8 @@ class Times:
 
 def columns(*parts: ArrayLike) -> Floats:
     """Return columns side by side as float64, shape (n, len(parts))."""
-    return np.stack([np.asarray(p, dtype=np.float64) for p in parts], axis=-1)
+    with np.errstate(invalid="ignore"):  # a damaged log may hold signalling NaNs
+        return np.stack([np.asarray(p, dtype=np.float64) for p in parts], axis=-1)
 
 
 def quaternions_from_euler(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Floats:

@@ -138,6 +138,17 @@ def test_vision_fixes_are_in_the_camera_frame_and_the_companions_clock(tmp_path:
     assert any("2 LANDING_TARGET messages" in p for p in recording.problems)
 
 
+def test_repeated_values_of_a_slow_sensor_are_thinned(tmp_path: Path) -> None:
+    items = lb.telemetry_flight(seconds=4.0)
+    imu = [fields for _, name, fields, _ in items if name == "HIGHRES_IMU"]
+    for k, fields in enumerate(imu[:100]):
+        fields["xmag"] = 0.1 + 0.01 * (k // 5)
+    (field,) = imported(tmp_path, lb.telemetry(items)).find("/magnetic_field")
+    steps = np.diff(field.stamp_ns) // 1_000_000
+    assert steps[:19].tolist() == [100] * 19
+    assert set(steps[20:].tolist()) == {200}
+
+
 @pytest.mark.parametrize(("shift_us", "clock"), [(0, "companion"), (-100_000_000, "autopilot")])
 def test_the_clock_of_vision_fixes_is_found(tmp_path: Path, shift_us: int, clock: str) -> None:
     items = lb.telemetry_flight(seconds=4.0)
