@@ -12,10 +12,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import platform
 import statistics
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +118,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"targets: decode >= {DECODE_TARGET:g}x, import <= {IMPORT_TARGET:g}: {'met' if good else 'MISSED'}"
     )
     if options.json:
-        options.json.write_text(json.dumps({"benchmark": "import_speed", "rows": rows}, indent=1) + "\n")
+        report = {
+            "date": time.strftime("%Y-%m-%d", time.gmtime()),
+            "python": platform.python_version(),
+            "pymavlink": version("pymavlink"),
+            "files": rows,
+        }
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
     return 0 if good else 1
 
 
