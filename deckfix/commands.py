@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from deckfix.files import check_output, existing, output_file
-from deckfix.progress import working
+from deckfix.terminal import printable, working
 
 if TYPE_CHECKING:
     from deckfix.result import Result
@@ -115,15 +115,11 @@ def digest(result: Result) -> str:
             f"{k.replace('_', ' ')} {v:.2f}" for k, v in summary["ratio"].items() if _is_ratio(k)
         )
         lines.append(f"  over the autopilot's own: {ratios}")
-    return "\n".join(_printable(line) for line in lines)
+    return "\n".join(printable(line) for line in lines)
 
 
 def _is_ratio(key: str) -> bool:
     return key not in ("window_s", "contact_s")
-
-
-def _printable(line: str) -> str:
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
 
 
 def _distinct(paths: list[str]) -> None:

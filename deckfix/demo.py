@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from deckfix.commands import digest, write_text
-from deckfix.files import OutputError, check_output, output_file
-from deckfix.progress import working
+from deckfix.files import check_output, output_file, output_folder
+from deckfix.terminal import working
 
 DEMO_SCENARIO = "landing_2026_06"
 
@@ -39,13 +39,7 @@ def run_demo(folder: str | Path, *, seed: int = 1, force: bool = False) -> str:
     """
     from deckfix.replaying import replay
 
-    target = Path(folder)
-    if target.exists() and not target.is_dir():
-        raise OutputError(f"{target}: is a file; give a folder")
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be created ({error.strerror}); choose another") from None
+    target = output_folder(folder)
     log, estimate, page = (target / name for name in ("flight.mcap", "estimate.mcap", "report.html"))
     for path in (log, estimate, page):
         check_output(path, force=force)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deckfix.files import InputError, OutputError, check_output, existing, output_file
-from deckfix.progress import tracked, working
+from deckfix.files import InputError, check_output, existing, output_file, output_folder
+from deckfix.terminal import tracked, working
 
 if TYPE_CHECKING:
     from logs.reader import Flight
@@ -45,7 +45,7 @@ def export_flight(
     if missing:
         present = ", ".join(sorted(flight.topics)) or "none"
         raise InputError(f"{place}: has no topic {missing[0]}; it has {present}")
-    _make_folder(target)
+    output_folder(target)
     wanted = list(topics) or sorted(flight.topics)
     said, skipped = [], []
     for topic in tracked(wanted, "exporting", len(wanted)):
@@ -118,15 +118,6 @@ def _names(topic: str, series: list[Series]) -> list[str]:
 
 def _safe(text: str) -> str:
     return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in text)[:100]
-
-
-def _make_folder(folder: Path) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; give a folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created ({error.strerror}); choose another") from None
 
 
 def _need_pyarrow() -> None:

@@ -50,6 +50,18 @@ def check_output(path: str | Path, *, force: bool, inputs: Sequence[str | Path] 
     return target
 
 
+def output_folder(path: str | Path) -> Path:
+    """Return a folder to write to, made where it is missing; raises ``OutputError`` where it cannot be."""
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; give a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created ({error.strerror}); choose another") from None
+    return folder
+
+
 @contextmanager
 def output_file(
     path: str | Path, *, force: bool = False, inputs: Sequence[str | Path] = ()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from deckfix.files import existing, output_file
-from deckfix.progress import working
+from deckfix.terminal import printable, working
 
 
 def import_flight(
@@ -33,7 +33,7 @@ def import_flight(
     lines += [f"  {topic}" for topic in topics]
     if recording.problems:
         lines += ["problems", *(f"  {p}" for p in recording.problems)]
-    return "\n".join(_printable(line) for line in lines)
+    return "\n".join(printable(line) for line in lines)
 
 
 def recover_flight(file: str | Path, output: str | Path, *, force: bool = False) -> str:
@@ -44,8 +44,4 @@ def recover_flight(file: str | Path, output: str | Path, *, force: bool = False)
     with output_file(output, force=force, inputs=[source]) as partial, working(f"recovering {source.name}"):
         told = recover(source, partial, force=True)
     lines = [f"wrote {output}: {told.summary()}", *(f"  {p}" for p in told.problems)]
-    return "\n".join(_printable(line) for line in lines)
-
-
-def _printable(line: str) -> str:
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
+    return "\n".join(printable(line) for line in lines)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from deckfix.files import existing
-from deckfix.progress import working
 from deckfix.streams import stream
+from deckfix.terminal import printable, working
 from estimation.events import Kind
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def describe(path: str | Path) -> str:
         "",
         *(["problems", *(f"  {p}" for p in flight.problems)] if flight.problems else ["no problems found"]),
     ]
-    return "\n".join("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in x) for x in lines)
+    return "\n".join(printable(line) for line in lines)
 
 
 def _rate_hz(info: ChannelInfo) -> float | None:

@@ -29,6 +29,7 @@ GREY = "#5b6470"
 GRID = "#e6e9ee"
 
 BUCKETS = 800
+SECONDS = "seconds from the first inertial sample"
 
 
 def label(text: str, longest: int = 60) -> str:
@@ -139,6 +140,11 @@ def axis(title: str = "", **more: Any) -> dict[str, Any]:
     }
 
 
+def time_axis(end: float) -> dict[str, Any]:
+    """Return the time axis of a figure with one panel, from 0 to ``end`` seconds."""
+    return axis(SECONDS, range=[0.0, max(end, 1e-3)])
+
+
 def layout(height: int, **more: Any) -> dict[str, Any]:
     """Return the layout that all figures share; they are as wide as their place."""
     return {
@@ -156,7 +162,7 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
 
 
 def stacked(
-    titles: Sequence[str], ranges: Sequence[tuple[float, float] | None], x_title: str, end: float
+    titles: Sequence[str], ranges: Sequence[tuple[float, float] | None], end: float
 ) -> dict[str, Any]:
     """Return axes for panels one above the other that share their time axis, 0 to ``end``, the first on
     top.
@@ -170,7 +176,7 @@ def stacked(
         top = 1.0 - i * (tall + gap)
         last = i == n - 1
         out[f"xaxis{suffix}"] = axis(
-            x_title if last else "",
+            SECONDS if last else "",
             anchor=f"y{suffix}",
             showticklabels=last,
             **({"range": [0.0, max(end, 1e-3)]} if i == 0 else {"matches": "x"}),

@@ -7,20 +7,12 @@ fetched.
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import html
-import json
-from collections.abc import Iterable, Sequence
-from importlib import resources
-from typing import Any
-
 import numpy as np
 
-from deckfix import figures
+from deckfix import figures, sensor_figures
 from deckfix._version import __version__
 from deckfix.findings import Finding, Severity, findings, verdict
-from deckfix.plotting import Figure
+from deckfix.page import Plots, document, table, text
 from deckfix.reference import RATIOS
 from deckfix.result import Result
 from estimation.outcome import Outcome
@@ -35,7 +27,7 @@ _WORDS = {Severity.SERIOUS: "serious", Severity.WARNING: "warning", Severity.NOT
 def render(result: Result) -> str:
     """Return the report of a result as HTML."""
     found = findings(result)
-    plots = _Plots()
+    plots = Plots()
     sections = [
         ("wrong", "What went wrong", _wrong(found)),
         ("track", "Track", _track(result, plots)),
@@ -52,84 +44,7 @@ def render(result: Result) -> str:
         if content
     )
     links = "".join(f'<a href="#{key}">{title}</a>' for key, title, content in sections if content)
-    return _page(result, _header(result, found), links, body, plots)
-
-
-def text(value: object) -> str:
-    """Return text for HTML: escaped, control characters (other than line breaks) made visible."""
-    clean = "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in str(value))
-    return html.escape(clean)
-
-
-def embedded_json(value: Any) -> str:
-    """Return JSON that may stand inside a ``<script>``: no ``<``, ``>``, ``&`` or line separators in it.
-
-    NumPy arrays of float32 become plotly's typed arrays; other numbers that are not finite become null.
-    """
-    out = json.dumps(_plain(value), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return out.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        data = np.ascontiguousarray(value, dtype="<f4")
-        return {"dtype": "f4", "bdata": base64.b64encode(data.tobytes()).decode("ascii")}
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, np.integer):
-        return int(value)
-    return value
-
-
-class _Plots:
-    """The figures of a page: places in the body, data at its end."""
-
-    def __init__(self) -> None:
-        self.data: list[str] = []
-
-    def place(self, figure: Figure, description: str) -> str:
-        """Return the place of a figure, described in words for those who do not see it."""
-        name = f"plot{len(self.data) + 1}"
-        self.data.append(f'<script type="application/json" id="data-{name}">{embedded_json(figure)}</script>')
-        height = int(figure["layout"]["height"])
-        return (
-            f'<div class="plot" id="{name}" role="img" aria-label="{text(description)}" '
-            f'style="min-height:{height}px"></div>'
-        )
-
-
-def _page(result: Result, header: str, links: str, body: str, plots: _Plots) -> str:
-    from plotly.offline import get_plotlyjs
-
-    assets = resources.files("deckfix")
-    style = (assets / "report.css").read_text(encoding="utf-8")
-    own = (assets / "report.js").read_text(encoding="utf-8")
-    library = get_plotlyjs()
-    allowed = " ".join(f"'sha256-{_sha256(script)}'" for script in (library, own))
-    policy = (
-        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data: blob:; "
-        "base-uri 'none'; form-action 'none'"
-    )
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<meta name="generator" content="deckfix {__version__}">'
-        f"<title>{text(result.flight)} - deckfix</title><style>{style}</style></head><body>"
-        f"<nav><div><b>deckfix</b>{links}</div></nav><main>{header}"
-        "<noscript><p>The plots need JavaScript; the tables do not.</p></noscript>"
-        f"{body}<footer>Written by deckfix {__version__}. This page is complete in itself: it loads nothing "
-        "and sends nothing.</footer></main>"
-        f"{''.join(plots.data)}<script>{library}</script><script>{own}</script></body></html>\n"
-    )
-
-
-def _sha256(script: str) -> str:
-    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    return document(result.flight, _header(result, found), links, body, plots)
 
 
 def _header(result: Result, found: list[Finding]) -> str:
@@ -196,10 +111,10 @@ def _wrong(found: list[Finding]) -> str:
     lead = ""
     if all(f.severity is Severity.NOTE for f in found):
         lead = '<p class="lead">Nothing that matters. These are notes.</p>'
-    return lead + _table(heads, rows, css="findings")
+    return lead + table(heads, rows, css="findings")
 
 
-def _track(result: Result, plots: _Plots) -> str:
+def _track(result: Result, plots: Plots) -> str:
     if not len(result.run.t_ns):
         return ""
     about = "North is up, and the plot is to scale."
@@ -216,7 +131,7 @@ def _track(result: Result, plots: _Plots) -> str:
     )
 
 
-def _estimate(result: Result, plots: _Plots) -> str:
+def _estimate(result: Result, plots: Plots) -> str:
     if not len(result.run.t_ns):
         return ""
     if result.truth_errors is not None:
@@ -265,14 +180,14 @@ def _ratio_table(result: Result) -> str:
         return ""
     start, end = (result.seconds(v) for v in (result.judged.start_ns, result.judged.end_ns))
     return (
-        _table(("rms error", "deckfix", "autopilot's own", "ratio"), rows, numeric=(1, 2, 3))
+        table(("rms error", "deckfix", "autopilot's own", "ratio"), rows, numeric=(1, 2, 3))
         + f'<p class="lead">Between {start:.1f} s and {end:.1f} s'
         + (", contact less half a second" if result.judged.contact_ns is not None else "")
         + ".</p>"
     )
 
 
-def _measurements(result: Result, plots: _Plots) -> str:
+def _measurements(result: Result, plots: Plots) -> str:
     shown = [n for n in result.measured if (s := result.nis(n)) is not None and s.count > 1]
     if not shown:
         return ""
@@ -287,17 +202,17 @@ def _measurements(result: Result, plots: _Plots) -> str:
         '<p class="lead">An innovation is a measurement less its prediction. Its normalised square, the NIS, '
         "averages to one per degree of freedom when noise and latency are right, and lies in the green band "
         "95 % of the time.</p>",
-        _table(("sensor", "innovations", "NIS / dof", "inside 95 % band"), rows, numeric=(1, 2, 3)),
+        table(("sensor", "innovations", "NIS / dof", "inside 95 % band"), rows, numeric=(1, 2, 3)),
     ]
     for name in shown[:MOST_SENSORS]:
-        figure = figures.innovations(result, name)
+        figure = sensor_figures.innovations(result, name)
         out.append(f"<h3>{text(name)}</h3>{plots.place(figure, f'Innovations and NIS of {name}')}")
     if len(shown) > MOST_SENSORS:
         out.append(f"<p>{len(shown) - MOST_SENSORS} further sensors are in the table only.</p>")
     return "".join(out)
 
 
-def _outcomes(result: Result, plots: _Plots) -> str:
+def _outcomes(result: Result, plots: Plots) -> str:
     if not len(result.run.records):
         return ""
     counts = {name: result.outcomes(name) for name in result.measured}
@@ -308,8 +223,11 @@ def _outcomes(result: Result, plots: _Plots) -> str:
     if result.unused:
         names = ", ".join(text(n) for n in result.unused)
         out.append(f" Never tried, because switched off in the configuration or not ready: {names}.")
-    out += ["</p>", plots.place(figures.outcomes(result), "Outcomes over time") if len(result.tried) else ""]
-    out.append(_table(heads, rows, numeric=tuple(range(1, len(heads)))))
+    out += [
+        "</p>",
+        plots.place(sensor_figures.outcomes(result), "Outcomes over time") if len(result.tried) else "",
+    ]
+    out.append(table(heads, rows, numeric=tuple(range(1, len(heads)))))
     if result.run.notes:
         lines = [
             f"<li>{result.seconds(int(t)):.1f} s: {text(note)}</li>" for t, note in result.run.notes[:200]
@@ -318,7 +236,7 @@ def _outcomes(result: Result, plots: _Plots) -> str:
     return "".join(out)
 
 
-def _states(result: Result, plots: _Plots) -> str:
+def _states(result: Result, plots: Plots) -> str:
     if not len(result.run.t_ns):
         return ""
     known = {
@@ -332,11 +250,11 @@ def _states(result: Result, plots: _Plots) -> str:
     out = ['<p class="lead">Slow errors of the sensors that the filter estimates along with the motion.</p>']
     for block in blocks:
         title = known.get(block, block.replace("_", " ").capitalize())
-        out.append(f"<h3>{text(title)}</h3>{plots.place(figures.states(result, block), title)}")
+        out.append(f"<h3>{text(title)}</h3>{plots.place(sensor_figures.states(result, block), title)}")
     return "".join(out) if blocks else ""
 
 
-def _inputs(result: Result, plots: _Plots) -> str:
+def _inputs(result: Result, plots: Plots) -> str:
     if not result.streams:
         return ""
     rows = []
@@ -353,11 +271,11 @@ def _inputs(result: Result, plots: _Plots) -> str:
             for name, values in result.clocks.items()
         ]
         names = list(next(iter(result.clocks.values())))
-        clock = "<h3>Clocks</h3>" + _table(("clock", *(text(n.replace("_", " ")) for n in names)), entries)
+        clock = "<h3>Clocks</h3>" + table(("clock", *(text(n.replace("_", " ")) for n in names)), entries)
     return (
         f'<p class="lead">{about}</p>'
-        + plots.place(figures.coverage(result), "When each sensor spoke")
-        + _table(heads, rows, numeric=(2, 3, 4, 5))
+        + plots.place(sensor_figures.coverage(result), "When each sensor spoke")
+        + table(heads, rows, numeric=(2, 3, 4, 5))
         + clock
     )
 
@@ -392,26 +310,3 @@ def _configuration(result: Result) -> str:
 
 def _shorten(value: str, longest: int = 2000) -> str:
     return value if len(value) <= longest else value[:longest] + " …"
-
-
-def _table(
-    heads: Sequence[str],
-    rows: Iterable[tuple[str, Sequence[str]]],
-    *,
-    numeric: tuple[int, ...] = (),
-    css: str = "",
-) -> str:
-    """Return a table of cells that are HTML already; each row comes with its CSS class."""
-
-    def cell(tag: str, i: int, content: str) -> str:
-        right = ' class="n"' if i in numeric else ""
-        head = f' data-head="{text(heads[i])}"' if tag == "td" else ""
-        return f"<{tag}{right}{head}>{content}</{tag}>"
-
-    head = "".join(cell("th", i, h) for i, h in enumerate(heads))
-    body = "".join(
-        f'<tr class="{kind}">{"".join(cell("td", i, c) for i, c in enumerate(cells))}</tr>'
-        for kind, cells in rows
-    )
-    table = f'<table class="{css}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
-    return f'<div class="scroll">{table}</div>'

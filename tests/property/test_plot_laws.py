@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from deckfix.page import embedded_json, text
 from deckfix.plotting import decimate, label
-from deckfix.report import embedded_json, text
 
 NUMBERS = st.floats(-1e6, 1e6) | st.just(float("nan"))
 

@@ -1,4 +1,4 @@
-"""What a person at a terminal sees while they wait; nothing at all in a pipe."""
+"""What a person at a terminal sees: progress (none in a pipe), and text that cannot steer the terminal."""
 
 from __future__ import annotations
 
@@ -32,3 +32,8 @@ def tracked(items: Iterable[T], text: str, total: int) -> Iterator[T]:
     from rich.progress import track
 
     yield from track(items, description=text, total=total, console=Console(stderr=True), transient=True)
+
+
+def printable(line: str) -> str:
+    """Return a line with control characters made visible, since text from a log may hold any."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
