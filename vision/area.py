@@ -264,7 +264,7 @@ class _Model:
         scale = 0.5
         for _ in range(1 if self.fixed_weight is not None else 3):
             lw = linear * weight[:, None]
-            coefficients: Array = np.linalg.solve(lw.T @ linear + np.diag(ridge), lw.T @ value)
+            coefficients = np.asarray(np.linalg.solve(lw.T @ linear + np.diag(ridge), lw.T @ value))
             rest = value - linear @ coefficients
             if self.fixed_weight is not None:
                 break
