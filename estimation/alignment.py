@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation.config import Config
+from estimation.deck import heave_stationary
 from estimation.events import Kind
 from estimation.frames import (
     Array,
@@ -43,6 +44,13 @@ from estimation.state import (
     Q0,
     V0,
     VELOCITY,
+    CAMERA_LATENCY,
+    CAMERA_MOUNT,
+    PLATFORM_HEAVE,
+    PLATFORM_LEVEL,
+    PLATFORM_OFFSET,
+    PLATFORM_SWAY,
+    RANGE_SCALE,
     Layout,
     nominal_zero,
 )
@@ -66,6 +74,10 @@ PATIENCE_NS = 3_000_000_000
 """How long a start waits for a barometer after the first fix."""
 TRY_NS = 100_000_000
 """Spacing of the attempts to start."""
+UNKNOWN_PLACE_M = 1000.0
+"""1-sigma of the platform's place before it is seen, where no anchor is configured [m]."""
+UNKNOWN_LEVEL_M = 100.0
+"""1-sigma of the platform's height before it is seen [m]."""
 FRESH_NS = 1_200_000_000
 """Oldest GPS, magnetometer or attitude that a start may use."""
 
@@ -375,9 +387,36 @@ class Aligner:
                 P[k, k] = P[d, d] + c.barometer.sigma_m**2
             else:
                 P[k, k] = 100.0**2
+        heave = np.zeros(7)
+        if o[PLATFORM_OFFSET] >= 0:
+            heave = self._put_platform(P)
         memory = np.zeros((self.sensors, MEMORY_SIZE))
         clock = np.array([t, t, t], dtype=np.int64)
-        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(2), memory)
+        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(3), memory, heave)
+
+
+    def _put_platform(self, P: Array) -> Array:
+        """Write what is known of the platform before it is seen into P; return its heave parameters."""
+        d, v, o = self.config.platform, self.config.vision, self.layout.offsets
+
+        def put(block: int, covariance: Array) -> None:
+            start = int(o[block])
+            P[start : start + len(covariance), start : start + len(covariance)] = covariance
+
+        radius = UNKNOWN_PLACE_M if d.anchor_radius_m is None else d.anchor_radius_m
+        put(PLATFORM_OFFSET, np.eye(2) * radius**2)
+        put(PLATFORM_LEVEL, np.eye(1) * UNKNOWN_LEVEL_M**2)
+        omega = 2.0 * math.pi / d.sway_period_s
+        sway = d.sway_sigma_m**2 * np.array([1.0, omega**2])
+        put(PLATFORM_SWAY, np.diag(np.tile(sway, 2)))
+        heave = np.array([1.0, *[2.0 * math.pi / d.heave_period_s] * 3, *[d.heave_damping] * 3])
+        stationary = heave_stationary(heave)
+        heave[0] = d.heave_sigma_m / math.sqrt(stationary[5, 5])
+        put(PLATFORM_HEAVE, heave[0] ** 2 * stationary)
+        put(RANGE_SCALE, np.eye(1) * v.scale_sigma**2)
+        put(CAMERA_LATENCY, np.eye(1) * v.latency_sigma_s**2)
+        put(CAMERA_MOUNT, np.eye(3) * v.mount_sigma_rad**2)
+        return heave
 
 
 def _attitude_from(force: Array, up: Array, yaw: float) -> Array:

@@ -20,12 +20,14 @@ import numba
 import numpy as np
 from numba.extending import overload, register_jitable
 
-from estimation import frames, models, parameters, state, update
+from estimation import deck, frames, models, parameters, state, update
 from estimation import rows as rows_module
 from estimation.frames import Array
-from estimation.models import BAROMETER, measure, right_jacobian, transition
+from estimation.deck import deck_output, seen_height
+from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
 from estimation.outcome import Outcome
 from estimation.rows import (
+    HEAVE_MODEL,
     KIND,
     LATE,
     OUTCOME,
@@ -40,10 +42,12 @@ from estimation.rows import (
     Int,
     Rows,
 )
-from estimation.state import ATTITUDE, Layout, Offsets, plus
+from estimation.state import ATTITUDE, PLATFORM_HEAVE, PLATFORM_SWAY, SIZES, Layout, Offsets, plus
 from estimation.update import (
     MAX_STEP_S,
+    considered,
     extra_noise,
+    hold_latency,
     interpolate,
     locked_out,
     reading_noise,
@@ -63,7 +67,7 @@ _IMU = 0
 def _cache_of_these_sources() -> Iterator[None]:
     """Let numba cache what is defined within, in a folder named after the sources that it is compiled from."""
     digest = hashlib.sha256()
-    for module in (frames, models, parameters, rows_module, state, update):
+    for module in (deck, frames, models, parameters, rows_module, state, update):
         digest.update(Path(inspect.getfile(module)).read_bytes())
     digest.update(Path(__file__).read_bytes())
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -103,19 +107,19 @@ def _rotate(m: Array, v: Array) -> Callable[[Array, Array], Array]:
     return product
 
 
-for _module in (frames, models, state, update):
+for _module in (deck, frames, models, state, update):
     for _function in vars(_module).values():
         if (
             inspect.isfunction(_function)
             and _function.__module__ == _module.__name__
-            and _function not in (frames.compose, frames.rotate)
+            and _function not in (frames.compose, frames.rotate, deck.heave_stationary)
         ):
             register_jitable(_function)
 
 
-def _propagate_covariance(P: Array, F: Array, Q: Array) -> None:
+def _propagate_covariance(P: Array, F: Array, Q: Array, span: Int) -> None:
     """Replace P by F P F' + Q, using that F is the identity but for the nine columns of attitude and biases, the
-    velocity in the position, and a diagonal behind."""
+    velocity in the position, and the spans of ``_spans`` behind."""
     n = P.shape[0]
     dt = F[0, 3]
     FP = np.empty((n, n))
@@ -130,13 +134,18 @@ def _propagate_covariance(P: Array, F: Array, Q: Array) -> None:
             for j in range(n):
                 FP[i, j] += f * P[k, j]
     for i in range(9, n):
-        f = F[i, i]
         for j in range(n):
-            FP[i, j] = f * P[i, j]
+            FP[i, j] = 0.0
+        for k in range(span[i, 0], span[i, 1]):
+            f = F[i, k]
+            for j in range(n):
+                FP[i, j] += f * P[k, j]
     for i in range(n):
         for j in range(i + 1):
             if j >= 9:
-                value = FP[i, j] * F[j, j]
+                value = 0.0
+                for k in range(span[j, 0], span[j, 1]):
+                    value += FP[i, k] * F[j, k]
             else:
                 value = 0.0 if j >= 6 else FP[i, j]
                 if j < 3:
@@ -148,9 +157,21 @@ def _propagate_covariance(P: Array, F: Array, Q: Array) -> None:
             P[j, i] = value
 
 
+def _spans(layout: Layout) -> Int:
+    """Return the first and last-but-one column in which each row of F (n, 2) is not zero, behind the ninth row."""
+    span = np.array([[i, i + 1] for i in range(layout.size)], dtype=np.int64)
+    for block, size in ((PLATFORM_SWAY, 2), (PLATFORM_HEAVE, 6)):
+        start = int(layout.offsets[block])
+        if start >= 0:
+            for i in range(start, start + SIZES[block]):
+                first = start + (i - start) // size * size
+                span[i] = first, first + size
+    return span
+
+
 def _propagate(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, t: int, t_imu: int, imu: Array, p: Array,
-    offsets: Offsets, F: Array, Q: Array,
+    offsets: Offsets, F: Array, Q: Array, heave: Array, span: Int,
 ) -> Array:  # fmt: skip
     total = t - clock[0]
     if total <= 0:
@@ -162,15 +183,15 @@ def _propagate(
     for k in range(steps):
         middle = a + total * ((k + 0.5) / steps)
         mean = interpolate(imu0, clock[1], imu, t_imu, middle)
-        x = transition(x, mean[:3], mean[3:], dt, extra, p, offsets, F, Q)
-        _propagate_covariance(P, F, Q)
+        x = transition(x, mean[:3], mean[3:], dt, extra, p, offsets, F, Q, heave)
+        _propagate_covariance(P, F, Q, span)
     clock[0] = t
     return x
 
 
 def _fuse(
-    x: Array, P: Array, memory: Array, kind: int, value: Array, own: Array, gyro: Array, t_s: float, late: int,
-    p: Array, offsets: Offsets, H: Array, result: Array,
+    x: Array, P: Array, memory: Array, scatter: Array, kind: int, value: Array, own: Array, gyro: Array,
+    t_s: float, late: int, p: Array, offsets: Offsets, H: Array, result: Array,
 ) -> tuple[int, int, Array]:  # fmt: skip
     n = P.shape[0]
     r = np.zeros(3)
@@ -196,6 +217,8 @@ def _fuse(
         result[5 + i] = math.sqrt(S[i, i])
     result[0] = nis
     result[1] = m
+    if kind == VISION:
+        result[8], result[9] = seen_height(r, R, x, p)
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     if w == 0.0:
@@ -215,10 +238,20 @@ def _fuse(
             for k in range(m):
                 K[i, j] += PHt[i, k] * inverse[k, j]
             error[i] += K[i, j] * r[j]
+    first, stop = considered(kind, scatter, p, offsets)
+    held = P[first:stop, first:stop].copy()
+    for i in range(first, stop):
+        error[i] = 0.0
     _joseph(P, K, H, R, 1.0 / w, m)
     att = offsets[ATTITUDE]
     _reset_attitude(P, right_jacobian(error[att : att + 3]), att)
-    return outcome, 0, plus(x, error, offsets)
+    x = plus(x, error, offsets)
+    if stop > 0:
+        for i in range(first, stop):
+            for j in range(first, stop):
+                P[i, j] = held[i - first, j - first]
+        hold_latency(x, p)
+    return outcome, 0, x
 
 
 def _innovation_covariance(H: Array, PHt: Array, R: Array, scale: float, m: int) -> Array:
@@ -302,7 +335,24 @@ def _reset_attitude(P: Array, G: Array, att: int) -> None:
             P[c, i] = mean
 
 
-for _helper in (_innovation_covariance, _inverse, _joseph, _reset_attitude):
+def _congruence(A: Array, P: Array, out: Array) -> None:
+    """Write A P A' (m, m) for A (m, n) with few entries."""
+    m, n = A.shape
+    AP = np.zeros((m, n))
+    for i in range(m):
+        for k in range(n):
+            if A[i, k] != 0.0:
+                for j in range(n):
+                    AP[i, j] += A[i, k] * P[k, j]
+    for i in range(m):
+        for j in range(m):
+            value = 0.0
+            for k in range(n):
+                value += AP[i, k] * A[j, k]
+            out[i, j] = value
+
+
+for _helper in (_congruence, _innovation_covariance, _inverse, _joseph, _reset_attitude):
     register_jitable(_helper)
 register_jitable(_propagate_covariance)
 register_jitable(_propagate)
@@ -310,9 +360,9 @@ register_jitable(_fuse)
 
 
 def _advance(
-    clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, p: Array, offsets: Offsets,
-    ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array, out_sigma: Array,
-    out_covariance: Array, count: int, emit_after_ns: int, period_ns: int,
+    clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, heave: Array, p: Array,
+    offsets: Offsets, span: Int, ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array, out_sigma: Array,
+    out_covariance: Array, out_deck: Array, out_deck_covariance: Array, count: int, emit_after_ns: int, period_ns: int,
 ) -> int:  # fmt: skip
     n = P.shape[0]
     F = np.empty((n, n))
@@ -327,12 +377,17 @@ def _advance(
                 following += 1
         t, t_imu = ints[i, T_NS], ints[following, T_NS]
         imu = floats[following, VALUE:OWN]
-        state = _propagate(clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q)
+        state = _propagate(clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, heave, span)
+        if ints[i, KIND] == HEAVE_MODEL:
+            heave[0] = floats[i, OWN]
+            heave[1:] = floats[i, VALUE:OWN]
+            ints[i, OUTCOME] = _FUSED
+            continue
         if i < following:
             gyro = interpolate(imu0, clock[1], imu, t_imu, t)[:3]
             t_s = (t - clock[2]) * 1e-9
             ints[i, OUTCOME], ints[i, RESET], state = _fuse(
-                state, P, memory[ints[i, SENSOR]], ints[i, KIND], floats[i, VALUE:OWN], floats[i, OWN:RESULT], gyro, t_s,
+                state, P, memory[ints[i, SENSOR]], scatter, ints[i, KIND], floats[i, VALUE:OWN], floats[i, OWN:RESULT], gyro, t_s,
                 ints[i, LATE], p, offsets, H, floats[i, RESULT:],
             )  # fmt: skip
             continue
@@ -346,6 +401,10 @@ def _advance(
             for j in range(n):
                 out_sigma[count, j] = math.sqrt(P[j, j])
             out_covariance[count] = P[:9, :9]
+            if out_deck.shape[1] > 0:
+                y, A = deck_output(state, heave, offsets, n)
+                out_deck[count] = y
+                _congruence(A, P, out_deck_covariance[count])
             count += 1
         following = i + 1
     x[:] = state
@@ -368,11 +427,12 @@ class CompiledEngine:
     p: Array
     layout: Layout
     state: FilterState
+    span: Int
 
     @classmethod
     def start(cls, p: Array, layout: Layout, state: FilterState) -> CompiledEngine:
         """Return an engine at a state."""
-        return cls(p, layout, state)
+        return cls(p, layout, state, _spans(layout))
 
     def save(self) -> FilterState:
         """Return a checkpoint."""
@@ -388,7 +448,7 @@ class CompiledEngine:
         """Process the rows start..stop in order; see ``FilterPyEngine.advance``."""
         s = self.state
         out.count = _kernel(
-            s.clock, s.x, s.P, s.imu, s.scatter, s.memory, self.p, self.layout.offsets,
-            rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.count, emit_after_ns,
+            s.clock, s.x, s.P, s.imu, s.scatter, s.memory, s.heave, self.p, self.layout.offsets, self.span,
+            rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.deck, out.deck_covariance, out.count, emit_after_ns,
             period_ns,
         )  # fmt: skip

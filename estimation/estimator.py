@@ -32,7 +32,7 @@ from estimation.frames import Array
 from estimation.history import Engine, History
 from estimation.outcome import Outcome
 from estimation.parameters import Site, pack_parameters
-from estimation.rows import PENDING, Estimates, FilterState, Int, Rows
+from estimation.rows import HEAVE_MODEL, PENDING, Estimates, FilterState, Int, Rows
 from estimation.state import BA0, BG0, P0, Q0, V0, Layout
 
 EngineName = Literal["auto", "filterpy", "compiled"]
@@ -184,6 +184,7 @@ class LandingEstimator:
         latency[Kind.MAGNETOMETER] = c.magnetometer.latency_s
         latency[Kind.ATTITUDE] = c.attitude.latency_s
         latency[Kind.RANGEFINDER] = c.rangefinder.latency_s
+        latency[Kind.VISION] = c.vision.latency_s
         self._latency = np.round(latency * 1e9)
         self._new_aligner()
 
@@ -350,7 +351,7 @@ class LandingEstimator:
         room = int(np.count_nonzero(h.rows.kind[h.done : h.size] == Kind.IMU))
         if room == 0:
             return
-        out = Estimates.empty(room, self.layout.size)
+        out = Estimates.empty(room, self.layout)
         h.advance(self._engine, out, self._period_ns)
         if out.count:
             self._estimates.append(out.filled())
@@ -473,7 +474,8 @@ class LandingEstimator:
         for outcome, count in zip(*np.unique(rows.outcome[imu], return_counts=True), strict=True):
             key = Outcome.FUSED if outcome == PENDING else Outcome(int(outcome))
             self._imu_outcomes[key] = self._imu_outcomes.get(key, 0) + int(count)
-        r = rows.take(np.flatnonzero(~imu | (rows.outcome > Outcome.DOWNWEIGHTED)))
+        kept = ~imu | (rows.outcome > Outcome.DOWNWEIGHTED)
+        r = rows.take(np.flatnonzero(kept & (rows.kind != HEAVE_MODEL)))
         records = np.zeros(len(r), dtype=RECORD_DTYPE)
         records["t_ns"], records["stamp_ns"], records["arrival_ns"] = r.t_ns, r.stamp_ns, r.arrival_ns
         records["sensor"], records["outcome"] = r.sensor, r.outcome
@@ -490,7 +492,7 @@ class LandingEstimator:
         return records
 
     def _collect(self) -> tuple[Estimates, NDArray[np.void], list[tuple[int, str]]]:
-        estimates = Estimates.concatenate(self._estimates, self.layout.size)
+        estimates = Estimates.concatenate(self._estimates, self.layout)
         records = self._final_records()
         notes = list(self._notes)
         self._estimates.clear()

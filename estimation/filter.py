@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimation import models, update
+from estimation.deck import deck_output, seen_height
 from estimation.frames import Array
 from estimation.outcome import Outcome
-from estimation.rows import Estimates, FilterState, Rows
+from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
 from estimation.state import ATTITUDE, Layout, plus
 
 if TYPE_CHECKING:
@@ -76,6 +77,10 @@ class FilterPyEngine:
             t_imu, imu = int(rows.t_ns[following]), rows.value[following]
             t = int(rows.t_ns[i])
             self._propagate(t, t_imu, imu)
+            if rows.kind[i] == HEAVE_MODEL:
+                s.heave[0], s.heave[1:] = rows.own[i, 0], rows.value[i]
+                rows.outcome[i] = Outcome.FUSED
+                continue
             if i < following:
                 gyro = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, t)[:3]
                 self._fuse(rows, i, gyro)
@@ -85,7 +90,7 @@ class FilterPyEngine:
             s.clock[1] = t
             s.imu = imu.copy()
             if t > emit_after_ns and new_period:
-                _write(out, t, s.x, s.P)
+                self._write(out, t)
             following = i + 1
 
     def _propagate(self, t: int, t_imu: int, imu: Array) -> None:
@@ -102,7 +107,7 @@ class FilterPyEngine:
         for k in range(steps):
             middle = a + total * ((k + 0.5) / steps)
             mean = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, middle)
-            s.x = models.transition(s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q)
+            s.x = models.transition(s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q, s.heave)
             self.ekf.P = s.P
             self.ekf.F = F
             self.ekf.Q = Q
@@ -140,6 +145,8 @@ class FilterPyEngine:
         rows.result[i, 1] = m
         rows.result[i, 2 : 2 + m] = r
         rows.result[i, 5 : 5 + m] = np.sqrt(np.diag(S))
+        if kind == models.VISION:
+            rows.seen[i] = seen_height(r, R, s.x, self.p)
         w = update.weight(nis, m, self.p)
         if w == 0.0:
             rows.outcome[i] = Outcome.REJECTED_GATE
@@ -158,13 +165,30 @@ class FilterPyEngine:
         ekf.P = s.P
         ekf.update(r, lambda _: H, lambda _: np.zeros(m), R=R / w)
         error = ekf.x
+        first, stop = update.considered(kind, s.scatter, self.p, self.layout.offsets)
+        held = s.P[first:stop, first:stop].copy()
+        error[first:stop] = 0.0
         s.x = plus(s.x, error, self.layout.offsets)
         P = ekf.P
         att = int(self.layout.offsets[ATTITUDE])
         G = models.right_jacobian(error[att : att + 3])
         P[att : att + 3, :] = G @ P[att : att + 3, :]
         P[:, att : att + 3] = P[:, att : att + 3] @ G.T
+        P[first:stop, first:stop] = held
+        if stop:
+            update.hold_latency(s.x, self.p)
         s.P = 0.5 * (P + P.T)
+
+    def _write(self, out: Estimates, t: int) -> None:
+        s, k = self.state, out.count
+        out.t_ns[k] = t
+        out.x[k] = s.x
+        out.sigma[k] = np.sqrt(np.diag(s.P))
+        out.covariance[k] = s.P[:9, :9]
+        if out.deck.shape[1]:
+            out.deck[k], A = deck_output(s.x, s.heave, self.layout.offsets, self.layout.size)
+            out.deck_covariance[k] = A @ s.P @ A.T
+        out.count = k + 1
 
 
 def _ekf(n: int) -> Any:
@@ -179,12 +203,3 @@ def _ekf(n: int) -> Any:
     ekf = ErrorStateEKF(dim_x=n, dim_z=3)
     ekf.x = np.zeros(n)
     return ekf
-
-
-def _write(out: Estimates, t: int, x: Array, P: Array) -> None:
-    k = out.count
-    out.t_ns[k] = t
-    out.x[k] = x
-    out.sigma[k] = np.sqrt(np.diag(P))
-    out.covariance[k] = P[:9, :9]
-    out.count = k + 1

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from estimation import parameters as par
+from estimation.deck import deck_transition, vision
 from estimation.frames import (
     Array,
     compose,
@@ -35,6 +36,7 @@ from estimation.state import (
     GPS_BIAS,
     GYRO_BIAS,
     P0,
+    PLATFORM_OFFSET,
     POSITION,
     Q0,
     V0,
@@ -42,7 +44,7 @@ from estimation.state import (
     Offsets,
 )
 
-GPS_POSITION, GPS_VELOCITY, BAROMETER, MAGNETOMETER, ATTITUDE_FIX, RANGE = 2, 3, 4, 5, 6, 7
+GPS_POSITION, GPS_VELOCITY, BAROMETER, MAGNETOMETER, ATTITUDE_FIX, RANGE, VISION = 2, 3, 4, 5, 6, 7, 8
 """Kinds of measurement, equal to ``estimation.events.Kind``."""
 
 UNUSABLE_COVARIANCE = -5
@@ -100,12 +102,13 @@ def transition(
     offsets: Offsets,
     F: Array,
     Q: Array,
+    heave: Array,
 ) -> Array:
     """Propagate the nominal state over ``dt`` [s]; write the error state's transition into F and noise into Q.
 
     ``gyro`` [rad/s] and ``accel`` [m/s^2] are the raw mean over the interval; ``scatter`` holds the additional
     white noise densities squared of accelerometer [(m/s^2)^2/Hz] and gyro [(rad/s)^2/Hz]. F and Q, (n, n), are
-    written whole. Returns the new nominal state. Strapdown in the local tangent plane; the Earth's rate is left
+    written whole; ``heave`` are the deck's seven parameters (``estimation.deck``), read where its blocks are on. Returns the new nominal state. Strapdown in the local tangent plane; the Earth's rate is left
     to the gyro bias (docs/limits.md).
     """
     n = F.shape[0]
@@ -165,6 +168,8 @@ def transition(
     if offsets[BARO_BIAS] >= 0:
         b = offsets[BARO_BIAS]
         Q[b, b] = p[par.BARO_BIAS_WALK] ** 2 * dt
+    if offsets[PLATFORM_OFFSET] >= 0:
+        deck_transition(x, y, dt, p, heave, offsets, F, Q)
     return y
 
 
@@ -206,6 +211,8 @@ def measure(
         return attitude(value, x, p, offsets, r, H, R)
     if kind == RANGE:
         return rangefinder(value, x, p, offsets, r, H, R)
+    if kind == VISION:
+        return vision(value, own, x, gyro - x[BG0 : BG0 + 3], p, offsets, r, H, R)
     return UNUSABLE_NOW
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.config import Config
-from estimation.frames import Array, normal_gravity
+from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity, quat_to_matrix
 
 (
     GRAVITY,
@@ -59,8 +59,31 @@ from estimation.frames import Array, normal_gravity
     GATE_1,
     GATE_2,
     GATE_3,
+    VISION_ANGLE,
+    VISION_RANGE,
+    VISION_FLOOR,
+    VISION_LEVER,
+    _,
+    _,
+    VISION_MOUNT,
+    _,
+    _,
+    _,
+    _,
+    _,
+    _,
+    _,
+    _,
+    LATENCY_WALK,
+    LATENCY_RATE,
+    LATENCY,
+    OFFSET_WALK,
+    SWAY_SIGMA,
+    SWAY_OMEGA,
+    SWAY_ZETA,
+    LEVEL_WALK,
     SIZE,
-) = range(46)
+) = range(69)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +128,15 @@ def pack_parameters(config: Config, site: Site) -> Array:
     p[RANGE_SIGMA_PER_M] = c.rangefinder.sigma_per_m
     p[RANGE_LEVER : RANGE_LEVER + 3] = c.rangefinder.lever_arm_m
     p[SURFACE_HEIGHT] = c.rangefinder.surface_height_m
+    v, d = c.vision, c.platform
+    p[VISION_ANGLE], p[VISION_RANGE], p[VISION_FLOOR] = v.angle_sigma_rad, v.range_sigma, v.floor_m
+    p[VISION_LEVER : VISION_LEVER + 3] = v.lever_arm_m
+    mount = quat_to_matrix(euler_to_quat(*v.mount_rpy_rad))
+    p[VISION_MOUNT : VISION_MOUNT + 9] = (R_CB_NOMINAL @ mount.T).ravel()
+    p[LATENCY_WALK], p[LATENCY_RATE], p[LATENCY] = v.latency_walk, v.latency_rate_radps, v.latency_s
+    p[OFFSET_WALK], p[LEVEL_WALK] = d.offset_walk, d.level_walk
+    p[SWAY_SIGMA], p[SWAY_ZETA] = d.sway_sigma_m, d.sway_damping
+    p[SWAY_OMEGA] = 2.0 * math.pi / d.sway_period_s
     for dof in (1, 2, 3):
         p[HUBER_1 + dof - 1] = chi_square_bound(c.filter.huber_sigma, dof)
         p[GATE_1 + dof - 1] = chi_square_bound(c.filter.gate_sigma, dof)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.frames import Array
-from estimation.state import NOMINAL_SIZE
+from estimation.state import NOMINAL_SIZE, PLATFORM_OFFSET, Layout
 
 Int = NDArray[np.int64]
+
+DECK_OUTPUTS = 8
+"""Entries of ``estimation.deck.deck_output``."""
 
 PENDING = -1
 """Outcome of a measurement that has not been tried yet."""
@@ -18,19 +22,22 @@ PENDING = -1
 
 T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = range(10)
 """Columns of ``Rows.ints``."""
-VALUE, OWN, RESULT, FLOATS = 0, 6, 12, 20
+VALUE, OWN, RESULT, SEEN, FLOATS = 0, 6, 12, 20, 22
 """First columns in ``Rows.floats``, and their number."""
+HEAVE_MODEL = 10
+"""Kind of a row that is no measurement: from here on the heave has the seven parameters in ``value`` and ``own``."""
 
 
 @dataclass(slots=True)
 class Rows:
-    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 20), with a view for each column.
+    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 22), with a view for each column.
 
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
     the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
     the inertial clock was past the content when it arrived. ``value`` and ``own`` (n, 6) are the event's value and
     covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved) and ``result`` (n, 8):
-    NIS, dimension, innovation (3), its predicted sigma (3).
+    NIS, dimension, innovation (3), its predicted sigma (3), and ``seen`` (n, 2): height of the deck as a fix shows
+    it [m] and its variance.
     """
 
     ints: Int
@@ -110,7 +117,12 @@ class Rows:
     @property
     def result(self) -> Array:
         """NIS, dimension, innovation (3), sigma (3)."""
-        return self.floats[:, RESULT:FLOATS]
+        return self.floats[:, RESULT:SEEN]
+
+    @property
+    def seen(self) -> Array:
+        """Height of the deck as a fix shows it [m], and its variance [m^2]."""
+        return self.floats[:, SEEN:FLOATS]
 
     def take(self, index: slice | Int) -> Rows:
         """Return the rows of an index: views for a slice, copies for an array."""
@@ -129,42 +141,47 @@ class Rows:
 
 @dataclass(slots=True)
 class Estimates:
-    """Estimates as columns: time, nominal state (n, 40), sigma of the error state (n, k), and the covariance (n, 9, 9)
-    of position, velocity and attitude error. ``count`` rows are filled."""
+    """Estimates as columns: time, nominal state (n, NOMINAL_SIZE), sigma of the error state (n, k), covariance (n, 9, 9)
+    of position, velocity and attitude error, and of the platform, where it is on, what ``deck_output`` gives (n, 8) with
+    its covariance (n, 8, 8). ``count`` rows are filled."""
 
     t_ns: Int
     x: Array
     sigma: Array
     covariance: Array
+    deck: Array
+    deck_covariance: Array
     count: int = 0
 
     @classmethod
-    def empty(cls, n: int, size: int) -> Estimates:
-        """Return room for n estimates with an error state of ``size``."""
+    def empty(cls, n: int, layout: Layout) -> Estimates:
+        """Return room for n estimates."""
+        deck = DECK_OUTPUTS if layout.offsets[PLATFORM_OFFSET] >= 0 else 0
         return cls(
-            np.zeros(n, dtype=np.int64), np.zeros((n, NOMINAL_SIZE)), np.zeros((n, size)), np.zeros((n, 9, 9))
+            np.zeros(n, dtype=np.int64),
+            np.zeros((n, NOMINAL_SIZE)),
+            np.zeros((n, layout.size)),
+            np.zeros((n, 9, 9)),
+            np.zeros((n, deck)),
+            np.zeros((n, deck, deck)),
         )
+
+    @property
+    def columns(self) -> tuple[NDArray[Any], ...]:
+        """All columns, in the order of the constructor."""
+        return self.t_ns, self.x, self.sigma, self.covariance, self.deck, self.deck_covariance
 
     def filled(self) -> Estimates:
         """Return copies of the rows that are filled."""
-        c = self.count
-        return Estimates(
-            self.t_ns[:c].copy(), self.x[:c].copy(), self.sigma[:c].copy(), self.covariance[:c].copy(), c
-        )
+        return Estimates(*(c[: self.count].copy() for c in self.columns), self.count)
 
     @staticmethod
-    def concatenate(parts: list[Estimates], size: int) -> Estimates:
+    def concatenate(parts: list[Estimates], layout: Layout) -> Estimates:
         """Join filled estimates in their order."""
         if not parts:
-            return Estimates.empty(0, size)
-        t = np.concatenate([e.t_ns for e in parts])
-        return Estimates(
-            t,
-            np.concatenate([e.x for e in parts]),
-            np.concatenate([e.sigma for e in parts]),
-            np.concatenate([e.covariance for e in parts]),
-            len(t),
-        )
+            return Estimates.empty(0, layout)
+        columns = [np.concatenate(c) for c in zip(*(e.columns for e in parts), strict=True)]
+        return Estimates(*columns, len(columns[0]))
 
 
 @dataclass(slots=True)
@@ -172,7 +189,8 @@ class FilterState:
     """Everything that the next step depends on; copied, it is a checkpoint.
 
     ``clock`` holds the state's time, the last inertial sample's and the start's [ns]; ``imu`` that sample;
-    ``scatter`` the vibration measure; ``memory`` what is remembered of each sensor.
+    ``scatter`` the vibration measure and the mean squared rotation; ``memory`` what is remembered of each sensor;
+    ``heave`` (7,) the deck's parameters.
     """
 
     clock: Int
@@ -181,6 +199,7 @@ class FilterState:
     imu: Array
     scatter: Array
     memory: Array
+    heave: Array
 
     def copy(self) -> FilterState:
         """Return an independent copy."""
@@ -191,4 +210,5 @@ class FilterState:
             self.imu.copy(),
             self.scatter.copy(),
             self.memory.copy(),
+            self.heave.copy(),
         )

@@ -48,7 +48,7 @@ BLOCKS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("platform_offset", ("n", "e"), "m"),
     ("platform_sway", ("n", "n_rate", "e", "e_rate"), "m"),
     ("platform_level", ("h",), "m"),
-    ("platform_heave", ("1", "2", "3", "4", "5", "6", "7", "8"), "m"),
+    ("platform_heave", ("1", "1_rate", "2", "2_rate", "3", "3_rate"), "m"),
     ("range_scale", ("s",), "-"),
     ("camera_latency", ("t",), "s"),
     ("camera_mount", ("x", "y", "z"), "rad"),
@@ -62,6 +62,18 @@ NOMINAL_SIZE = sum(SIZES) + 1
 
 P0, V0, Q0, BG0, BA0, BP0, BB0 = (NOMINAL[b] for b in range(7))
 """First places in the nominal state of position, velocity, attitude, biases of gyro, accelerometer, GPS, baro."""
+PO0, PS0, PL0, PH0, RS0, CL0, CM0 = (NOMINAL[b] for b in range(7, 14))
+"""First places of the platform's offset, sway, level and heave, of range scale, camera latency and mount."""
+DECK_BLOCKS = (
+    PLATFORM_OFFSET,
+    PLATFORM_SWAY,
+    PLATFORM_LEVEL,
+    PLATFORM_HEAVE,
+    RANGE_SCALE,
+    CAMERA_LATENCY,
+    CAMERA_MOUNT,
+)
+"""The blocks that vision needs; they are switched on together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +91,8 @@ class Layout:
             on.append(GPS_BIAS)
         if config.barometer.use:
             on.append(BARO_BIAS)
+        if config.platform.use:
+            on.extend(DECK_BLOCKS)
         return cls.with_blocks(on)
 
     @classmethod

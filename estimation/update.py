@@ -11,8 +11,22 @@ import numpy as np
 
 from estimation import parameters as par
 from estimation.frames import Array
-from estimation.models import BAROMETER, GPS_POSITION, GPS_VELOCITY
-from estimation.state import BARO_BIAS, BB0, GPS_BIAS, P0, POSITION, V0, VELOCITY, Offsets
+from estimation.models import BAROMETER, GPS_POSITION, GPS_VELOCITY, VISION
+from estimation.state import (
+    BARO_BIAS,
+    BB0,
+    CAMERA_LATENCY,
+    CAMERA_MOUNT,
+    CL0,
+    GPS_BIAS,
+    P0,
+    PLATFORM_LEVEL,
+    PLATFORM_OFFSET,
+    POSITION,
+    V0,
+    VELOCITY,
+    Offsets,
+)
 
 MAX_STEP_S = 0.025
 """Longest step of the strapdown integration [s]; longer intervals are cut."""
@@ -24,9 +38,15 @@ GAP_ATTITUDE = 0.15
 """Unknown rotation in a gap [rad/rts], 1-sigma: a hovering multirotor stays near level and holds its heading."""
 SCATTER_TIME_S = 1.0
 """Averaging time of the vibration measure [s]."""
+ROTATION_TIME_S = 5.0
+"""Averaging time of the rotation that decides whether a camera's age can be learned [s]."""
+MAX_LATENCY_S = 0.15
+"""A camera's age stays between 0 and this [s]."""
 RESET_COUNT = 5
 """Rejected measurements that must agree before a reset."""
 
+RELOCATION_M = 30.0
+"""How far a platform may have moved when vision contradicts the filter, but not itself, for long [m]."""
 MEMORY_SIZE = 9
 """Entries per sensor of what is remembered of it: rejected in a row, first and last time of these [s], last rejected
 innovation (3); time [s] and innovation of the last reading, variance of its white noise (``reading_noise``)."""
@@ -45,7 +65,7 @@ def scatter_update(scatter: Array, imu0: Array, imu1: Array, dt: float) -> None:
     """Update in place the vibration measure: mean variance of white noise that explains the sample differences.
 
     ``scatter`` is (accelerometer, gyro) [(m/s^2)^2, (rad/s)^2] per axis; half the mean squared difference of
-    neighbouring samples, averaged over ``SCATTER_TIME_S``.
+    neighbouring samples, averaged over ``SCATTER_TIME_S``; and the mean squared rotation over ``ROTATION_TIME_S``.
     """
     alpha = 1.0 - math.exp(-dt / SCATTER_TIME_S)
     gyro = 0.0
@@ -55,6 +75,8 @@ def scatter_update(scatter: Array, imu0: Array, imu1: Array, dt: float) -> None:
         accel += (imu1[3 + i] - imu0[3 + i]) ** 2
     scatter[0] += alpha * (accel / 6.0 - scatter[0])
     scatter[1] += alpha * (gyro / 6.0 - scatter[1])
+    rate = imu1[0] ** 2 + imu1[1] ** 2 + imu1[2] ** 2
+    scatter[2] += (1.0 - math.exp(-dt / ROTATION_TIME_S)) * (rate - scatter[2])
 
 
 def extra_noise(scatter: Array, dt_imu: float, p: Array) -> Array:
@@ -101,15 +123,32 @@ def weight(nis: float, dimension: int, p: Array) -> float:
     return 1.0 if nis <= bound else math.sqrt(bound / nis)
 
 
+def considered(kind: int, scatter: Array, p: Array, offsets: Offsets) -> tuple[int, int]:
+    """Return the first and last-but-one place of the states that a measurement may not move (Schmidt's filter).
+
+    The camera's mounting always, and its age but for vision under enough rotation. They lie side by side.
+    """
+    if offsets[CAMERA_MOUNT] < 0:
+        return 0, 0
+    learn = kind == VISION and scatter[2] >= p[par.LATENCY_RATE] ** 2
+    start = offsets[CAMERA_MOUNT] if learn else offsets[CAMERA_LATENCY]
+    return start, offsets[CAMERA_MOUNT] + 3
+
+
+def hold_latency(x: Array, p: Array) -> None:
+    """Keep the camera's age, calibrated plus learned, within its box; in place."""
+    x[CL0] = min(max(x[CL0], -p[par.LATENCY]), MAX_LATENCY_S - p[par.LATENCY])
+
+
 def locked_out(memory: Array, kind: int, t_s: float, r: Array, dimension: int, p: Array) -> bool:
     """Note a rejection; return True when the sensor has contradicted the filter, but not itself, for too long.
 
-    ``memory`` is the sensor's own. Only sensors that carry a datum (GPS, barometer) can ever be right against
+    ``memory`` is the sensor's own. Only sensors that carry a datum (GPS, barometer, vision) can ever be right against
     the filter; no number of rejections lets any other sensor in.
     """
     if kind == GPS_POSITION:
         tolerance = 5.0
-    elif kind in (GPS_VELOCITY, BAROMETER):
+    elif kind in (GPS_VELOCITY, BAROMETER, VISION):
         tolerance = 2.0
     else:
         return False
@@ -132,6 +171,12 @@ def reset_datum(kind: int, x: Array, P: Array, r: Array, R: Array, dimension: in
     Position (velocity, barometer offset) takes the innovation; its correlations with all else are cut, so that
     attitude and biases keep what they know.
     """
+    if kind == VISION:
+        # The platform is not where it was thought to be: its place is open again, the vehicle's is not touched.
+        for i in range(2):
+            P[offsets[PLATFORM_OFFSET] + i, offsets[PLATFORM_OFFSET] + i] += RELOCATION_M**2
+        P[offsets[PLATFORM_LEVEL], offsets[PLATFORM_LEVEL]] += RELOCATION_M**2
+        return
     if kind == GPS_POSITION:
         block, place = offsets[POSITION], P0
     elif kind == GPS_VELOCITY:
