@@ -18,6 +18,7 @@ import click
 
 from deckfix._version import __version__
 from deckfix.cli_detect import detect
+from deckfix.cli_detect import detect
 from deckfix.cli_vision import calibrate, target
 
 _ENGINE = click.option(
@@ -27,7 +28,7 @@ _ENGINE = click.option(
 _FORCE = click.option("--force", is_flag=True, help="Overwrite output files that exist.")
 
 
-_ORDER = ("demo", "simulate", "import", "info", "replay", "report", "export", "target", "calibrate")
+_ORDER = ("demo", "simulate", "import", "info", "replay", "report", "export", "detect", "target", "calibrate")
 
 
 class _Ordered(click.Group):
@@ -188,6 +189,7 @@ def demo(output: str, seed: int, force: bool) -> None:
     _say(run_demo(output, seed=seed, force=force))
 
 
+deckfix.add_command(detect)
 deckfix.add_command(detect)
 deckfix.add_command(target)
 deckfix.add_command(calibrate)
