@@ -18,7 +18,6 @@ import click
 
 from deckfix._version import __version__
 from deckfix.cli_detect import detect
-from deckfix.cli_detect import detect
 from deckfix.cli_vision import calibrate, target
 
 _ENGINE = click.option(
@@ -189,7 +188,6 @@ def demo(output: str, seed: int, force: bool) -> None:
     _say(run_demo(output, seed=seed, force=force))
 
 
-deckfix.add_command(detect)
 deckfix.add_command(detect)
 deckfix.add_command(target)
 deckfix.add_command(calibrate)
