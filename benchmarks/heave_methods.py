@@ -117,7 +117,7 @@ def autoregressive(observation: Observation) -> Array:
 
 def band_pass(observation: Observation, model: heave.HeaveModel) -> Array:
     """The six-state block fitted to the learned spectrum, with a free level, as a filter would carry it."""
-    block = heave.fit_band_pass(model.frequency_hz, model.density_m2ps, model.noise_density_m2ps)
+    block = model.band_pass()
     time, value, variance = average(observation, 0.125)
     step = 0.05
     lag = np.arange(0.0, -time[0] + HORIZONS_S[-1] + 0.1, step)

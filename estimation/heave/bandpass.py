@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+NARROWEST = 0.02
+"""Smallest damping of a section: narrower ones hold on to a phase that a growing swell leaves."""
+
 
 @dataclass(frozen=True, slots=True)
 class BandPass:
@@ -118,7 +121,9 @@ def fit_band_pass(
         starts = [_parameters(previous, scale)]
     bounds = []
     for sections in order:
-        bounds += [(-40.0, 40.0)] + [(low, high)] * sections + [(math.log(0.01), math.log(2.0))] * sections
+        bounds += (
+            [(-40.0, 40.0)] + [(low, high)] * sections + [(math.log(NARROWEST), math.log(2.0))] * sections
+        )
     limits = np.array(bounds).T
     best = min(
         (

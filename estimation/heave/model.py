@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimation.heave import forecast as forecasting
+from estimation.heave.bandpass import BandPass, fit_band_pass
 from estimation.heave.basis import Basis
 from estimation.heave.forecast import Coefficients, Forecast
 from estimation.heave.series import WINDOW_S, Window, cut_window
@@ -91,7 +92,7 @@ class HeaveModel:
 
     @property
     def sd_m(self) -> float:
-        """Standard deviation of the heave about its level [m]."""
+        """Standard deviation of the heave about its level [m]: of the spectrum or as seen, whichever is larger."""
         return math.sqrt(self.coefficients.variance_m2)
 
     @property
@@ -202,6 +203,19 @@ class HeaveModel:
             c, start_s, duration_s, rate_limit_mps, height_band_m, samples, generator
         )
 
+    def band_pass(self, *, blocks: int = 1, previous: BandPass | None = None) -> BandPass:
+        """State-space block of the learned spectrum with the motion's standard deviation; ``bhr`` only.
+
+        ``blocks`` is 1 for six states, 2 for eight; ``previous`` is where the search begins.
+        """
+        density = self.density_m2ps
+        if not np.any(density > 0):
+            raise ValueError("there is no motion to fit a block to")
+        scale = self.coefficients.variance_m2 / float(self.power_m2.sum())
+        return fit_band_pass(
+            self.frequency_hz, scale * density, self.noise_density_m2ps, blocks=blocks, previous=previous
+        )
+
     def _level(self) -> tuple[float, float]:
         c = self.coefficients
         column = c.basis.values(np.zeros(1))[0, c.level]
@@ -297,13 +311,21 @@ def _level_only(window: Window, reason: str, previous: HeaveModel | None) -> Coe
 
 
 def _of_spectrum(window: Window, learned: LearnedSpectrum, settings: SpectrumSettings) -> Coefficients:
+    """The learned coefficients. The motion's own variance is the larger of the spectrum's and that seen.
+
+    A smooth spectrum holds less than a regular motion has: its harmonics then add up in phase.
+    """
     omega = 2.0 * np.pi * learned.basis.frequency_hz
+    harmonics = learned.mean.copy()
+    harmonics[2 * len(omega) :] = 0.0
+    time = np.linspace(-window.span_s, 0.0, max(16, int(4.0 * window.span_s)))
+    heave, rate = learned.basis.values(time) @ harmonics, learned.basis.rates(time) @ harmonics
     return Coefficients(
         learned.basis,
         learned.mean,
         learned.covariance,
         window.offset_m,
-        float(learned.power_m2.sum()),
-        float(learned.power_m2 @ omega**2),
+        max(float(learned.power_m2.sum()), float(np.mean(heave**2))),
+        max(float(learned.power_m2 @ omega**2), float(np.mean(rate**2))),
         settings.horizon_s + 0.5 * grid_span(window),
     )

@@ -58,6 +58,8 @@ class SpectrumSettings:
     """1 sigma of the log of the true noise over the stated one."""
     iterations: int = 30
     warm_iterations: int = 12
+    warm_refits: int = 10
+    """So many refits that start from their predecessor are followed by one that also searches from scratch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +68,8 @@ class LearnedSpectrum:
 
     ``power_m2`` (m,) variance of each harmonic; ``mean`` (k,) and ``covariance`` (k, k) of all coefficients
     of ``basis``; ``parameters`` for the next warm start; ``drift_mps`` [m per root second]; ``noise_scale``
-    the samples' scatter over the sigma that they were given with.
+    the samples' scatter over the sigma that they were given with; ``age`` counts the refits since a search from
+    scratch.
     """
 
     basis: Basis
@@ -77,6 +80,7 @@ class LearnedSpectrum:
     drift_mps: float
     noise_scale: float
     evaluations: int
+    age: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +172,7 @@ def learn(
     ``previous`` is an earlier result to start the search from; the result is the same up to the search's
     tolerance. Cost: about 2 ms an iteration at 60 s.
     """
-    from scipy.optimize import minimize
+    from scipy.optimize import OptimizeResult, minimize
 
     settings = settings or SpectrumSettings()
     span = grid_span(window)
@@ -203,18 +207,21 @@ def learn(
         z = (x - centre) / sigma
         return value + 0.5 * float(z @ z), gradient + z / sigma
 
-    start = np.clip(np.concatenate([first, [log_drift, 0.0], np.zeros(bumps.shape[1])]), low, high)
-    iterations = settings.iterations
-    if previous is not None:
-        same = previous.parameters.shape == start.shape
-        warm = previous.parameters if same else np.append(previous.parameters[: where + 2], 0.0 * bumps[0])
-        warm = np.clip(warm, low, high)
-        if objective(warm)[0] < objective(start)[0]:
-            start = warm
-            iterations = settings.warm_iterations if same else iterations
-    found = minimize(
-        objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations}
-    )
+    def search(start: Array, iterations: int) -> OptimizeResult:
+        options = {"maxiter": iterations}
+        return minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+
+    cold = np.clip(np.concatenate([first, [log_drift, 0.0], np.zeros(bumps.shape[1])]), low, high)
+    age, evaluations, found = 0, 0, None
+    if previous is not None and previous.parameters.shape == cold.shape:
+        warm = np.clip(previous.parameters, low, high)
+        if objective(warm)[0] < objective(cold)[0]:
+            found, age = search(warm, settings.warm_iterations), previous.age + 1
+            evaluations = int(found.nfev)
+    if found is None or age >= settings.warm_refits:
+        fresh = search(cold, settings.iterations)
+        evaluations += int(fresh.nfev)
+        found, age = (fresh if found is None or fresh.fun < found.fun else found), 0
     x: Array = found.x
     power, derivative = shape(x)
     uncertain = _log_covariance(problem, power, derivative, x, sigma, where)
@@ -224,7 +231,7 @@ def learn(
     derivative = by_parameter * power
     mean, covariance = _posterior(problem, power, derivative, x, uncertain, where)
     drift, scale = (math.exp(0.5 * value) for value in x[where : where + 2])
-    return LearnedSpectrum(basis, power, mean, covariance, x, drift, scale, int(found.nfev))
+    return LearnedSpectrum(basis, power, mean, covariance, x, drift, scale, evaluations, age)
 
 
 def _compress(window: Window, basis: Basis, settings: SpectrumSettings) -> _Problem:

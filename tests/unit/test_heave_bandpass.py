@@ -80,9 +80,13 @@ def test_block_of_a_learned_spectrum() -> None:
     t = np.arange(0.0, 60.0, 0.06)
     value = 0.3 * np.sin(2 * np.pi * t / 4.0) + 0.2 * np.sin(2 * np.pi * t / 5.1 + 1.0)
     model = heave.fit(t, value + rng.normal(0, 0.03, len(t)), 0.03)
-    block = heave.fit_band_pass(model.frequency_hz, model.density_m2ps, model.noise_density_m2ps)
+    block = model.band_pass()
     assert block.sd_m == pytest.approx(model.sd_m, rel=0.1)
-    assert 2 * np.pi / block.omega_radps.max() < 5.0
+    assert model.band_pass(blocks=2, previous=block).size == 8
+    peak_hz = FREQUENCY[int(np.argmax(block.density(FREQUENCY)))]
+    assert 1 / 5.3 < peak_hz < 1 / 3.8
+    with pytest.raises(ValueError, match="no spectral density"):
+        heave.fit(t, value, 0.03, method="sinusoids").band_pass()
 
 
 @pytest.mark.parametrize(
