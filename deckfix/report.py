@@ -34,7 +34,7 @@ def render(result: Result) -> str:
         ("estimate", "Estimate", _estimate(result, plots)),
         ("measurements", "Measurements", _measurements(result, plots)),
         ("outcomes", "Outcomes", _outcomes(result, plots)),
-        ("states", "Biases", _states(result, plots)),
+        ("states", "Biases and other states", _states(result, plots)),
         ("inputs", "Rates and gaps", _inputs(result, plots)),
         ("configuration", "Configuration", _configuration(result)),
     ]
@@ -247,7 +247,9 @@ def _states(result: Result, plots: Plots) -> str:
     }
     blocks = list(dict.fromkeys(n.split(".")[0] for n in result.run.state_names))
     blocks = [b for b in blocks if b not in ("position", "velocity", "attitude")]
-    out = ['<p class="lead">Slow errors of the sensors that the filter estimates along with the motion.</p>']
+    out = [
+        '<p class="lead">What the filter estimates along with the motion: slow errors of the sensors first.</p>'
+    ]
     for block in blocks:
         title = known.get(block, block.replace("_", " ").capitalize())
         out.append(f"<h3>{text(title)}</h3>{plots.place(sensor_figures.states(result, block), title)}")

@@ -125,15 +125,18 @@ def outcomes(result: Result) -> Figure:
     return {"data": data, "layout": layout(330, barmode="stack", bargap=0, hovermode="x unified", **axes)}
 
 
+_IN_DEGREES = {"rad": ("deg", 180.0 / np.pi), "rad/s": ("deg/s", 180.0 / np.pi)}
+
+
 def states(result: Result, block: str) -> Figure:
     """Return the entries of one block of the state with their 3 sigma bands, one panel each."""
     t = result.t_s
     chosen = [i for i, n in enumerate(result.run.state_names) if n.split(".")[0] == block]
-    unit, factor = _block_unit(block)
     data: list[Trace] = []
     ranges = []
     titles = []
     for row, i in enumerate(chosen, start=1):
+        unit, factor = _IN_DEGREES.get(result.run.state_units[i], (result.run.state_units[i], 1.0))
         value = result.state_values[:, i] * factor
         sigma = 3.0 * result.run.sigma[:, i] * factor
         data += band(t, value - sigma, value + sigma, "±3 sigma", row, legend=row == 1)
@@ -141,7 +144,7 @@ def states(result: Result, block: str) -> Figure:
         late = t > 0.25 * t[-1] if len(t) else np.zeros(0, dtype=bool)
         ranges.append(limits(value, (value - sigma)[late], (value + sigma)[late]))
         component = result.run.state_names[i].split(".")[-1]
-        titles.append(f"{label(component)} [{unit}]")
+        titles.append(f"{label(component)} [{label(unit)}]")
     return {
         "data": data,
         "layout": layout(90 + 100 * len(chosen), **stacked(titles, ranges, result.duration_s)),
@@ -186,19 +189,6 @@ def coverage(result: Result) -> Figure:
         ),
     }
     return {"data": data, "layout": layout(80 + 30 * len(names), hovermode="closest", **axes)}
-
-
-def _block_unit(block: str) -> tuple[str, float]:
-    if block == "gyro_bias":
-        return "deg/s", 180.0 / np.pi
-    units = {
-        "accel_bias": "m/s²",
-        "gps_bias": "m",
-        "baro_bias": "m",
-        "camera_latency": "s",
-        "camera_mount": "rad",
-    }
-    return units.get(block, "-" if block == "range_scale" else "m"), 1.0
 
 
 def _running_mean(values: Array, width: int) -> Array:

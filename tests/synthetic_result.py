@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,7 @@ def synthetic_run(seed: int = 1, seconds: float = 76.0, rate_hz: float = 50.0) -
     nominal = np.zeros((n, NOMINAL_SIZE))
     nominal[:, 0:3], nominal[:, 3:6], nominal[:, 6:10] = measured, velocity + smooth[:, 3:6], q_est
     nominal[:, 10:16] = walk
-    run = Run(
+    values: dict[str, Any] = dict(
         engine="filterpy",
         t_ns=t,
         position_m=measured,
@@ -64,7 +64,11 @@ def synthetic_run(seed: int = 1, seconds: float = 76.0, rate_hz: float = 50.0) -
         origin=(float(np.deg2rad(54.0)), float(np.deg2rad(7.5)), 12.0),
         declination_rad=0.05,
         missing="",
+        deck=np.zeros((n, 0)),
+        deck_covariance=np.zeros((n, 0, 0)),
+        heave=[],
     )
+    run = Run(**{f.name: values[f.name] for f in fields(Run)})
     return run, truth
 
 
