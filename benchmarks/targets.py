@@ -30,7 +30,7 @@ class Target:
         """Whether the number is there and keeps its bound."""
         if self.value is None or not np.isfinite(self.value):
             return False
-        return self.value >= self.bound if self.at_least else self.value <= self.bound
+        return bool(self.value >= self.bound if self.at_least else self.value <= self.bound)
 
 
 @dataclass(slots=True)
