@@ -44,30 +44,30 @@ def synthetic_run(seed: int = 1, seconds: float = 76.0, rate_hz: float = 50.0) -
     nominal = np.zeros((n, NOMINAL_SIZE))
     nominal[:, 0:3], nominal[:, 3:6], nominal[:, 6:10] = measured, velocity + smooth[:, 3:6], q_est
     nominal[:, 10:16] = walk
-    values: dict[str, Any] = dict(
-        engine="filterpy",
-        t_ns=t,
-        position_m=measured,
-        velocity_mps=velocity + smooth[:, 3:6],
-        quaternion=q_est,
-        covariance=np.repeat(np.diag(sigma**2)[None], n, axis=0),
-        gyro_bias=walk[:, :3],
-        accel_bias=walk[:, 3:6],
-        nominal=nominal,
-        sigma=np.exp(-s / 15)[:, None] * 4e-3 + np.full(layout.size, 1e-3),
-        state_names=layout.names,
-        state_units=layout.units,
-        records=_records(rng, seconds),
-        sensors=("gps_position", "gps_velocity", "barometer", "magnetometer"),
-        notes=[(int(t[0]), "initialised at rest")],
-        imu_outcomes={Outcome.FUSED: n},
-        origin=(float(np.deg2rad(54.0)), float(np.deg2rad(7.5)), 12.0),
-        declination_rad=0.05,
-        missing="",
-        deck=np.zeros((n, 0)),
-        deck_covariance=np.zeros((n, 0, 0)),
-        heave=[],
-    )
+    values: dict[str, Any] = {
+        "engine": "filterpy",
+        "t_ns": t,
+        "position_m": measured,
+        "velocity_mps": velocity + smooth[:, 3:6],
+        "quaternion": q_est,
+        "covariance": np.repeat(np.diag(sigma**2)[None], n, axis=0),
+        "gyro_bias": walk[:, :3],
+        "accel_bias": walk[:, 3:6],
+        "nominal": nominal,
+        "sigma": np.exp(-s / 15)[:, None] * 4e-3 + np.full(layout.size, 1e-3),
+        "state_names": layout.names,
+        "state_units": layout.units,
+        "records": _records(rng, seconds),
+        "sensors": ("gps_position", "gps_velocity", "barometer", "magnetometer"),
+        "notes": [(int(t[0]), "initialised at rest")],
+        "imu_outcomes": {Outcome.FUSED: n},
+        "origin": (float(np.deg2rad(54.0)), float(np.deg2rad(7.5)), 12.0),
+        "declination_rad": 0.05,
+        "missing": "",
+        "deck": np.zeros((n, 0)),
+        "deck_covariance": np.zeros((n, 0, 0)),
+        "heave": [],
+    }
     run = Run(**{f.name: values[f.name] for f in fields(Run)})
     return run, truth
 
