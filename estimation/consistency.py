@@ -37,7 +37,8 @@ def normalised_squared(error: Array, covariance: Array) -> Array:
     usable = np.isfinite(unit).all(axis=(-2, -1)) & np.isfinite(e).all(axis=-1)
     usable &= np.linalg.det(np.where(usable[..., None, None], unit, np.eye(error.shape[-1]))) > 0.0
     unit = np.where(usable[..., None, None], unit, np.eye(error.shape[-1]))
-    value = np.sum(e * np.linalg.solve(unit, np.where(usable[..., None], e, 0.0)[..., None])[..., 0], axis=-1)
+    e = np.where(usable[..., None], e, 0.0)
+    value = np.sum(e * np.linalg.solve(unit, e[..., None])[..., 0], axis=-1)
     return np.where(usable, value, np.nan)
 
 
