@@ -196,7 +196,9 @@ def _inputs(result: Result) -> Iterator[Finding]:
             )
         if s.gaps:
             worst = s.longest_gap_s
-            severe = worst > (0.5 if s.kind is Kind.IMU else 5.0)
+            # A target out of sight, or a sensor that is not used, is no trouble.
+            matters = s.kind is not Kind.VISION and s.name not in result.unused
+            severe = matters and worst > (0.5 if s.kind is Kind.IMU else 5.0)
             yield Finding(
                 Severity.WARNING if severe else Severity.NOTE,
                 f"{s.name}: {_count(len(s.gaps), 'gap')}, the longest {worst:.2f} s",
