@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.plane import LevelPlane, rotation_xy
-from vision.refine import INV_SQRT_2PI, Fit, edge_sides, phi
+from vision.lines import edge_sides
+from vision.refine import INV_SQRT_2PI, Fit, phi
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-GROWTH_SIGMA_PX = 0.12
+GROWTH_SIGMA_PX = 0.25
 BLUR_LOG_SIGMA = 0.4
 START_BLUR_PX = 0.62
 MAX_PIXELS = 1600

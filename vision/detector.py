@@ -14,7 +14,8 @@ from vision.camera import Camera, check_rotation
 from vision.ellipse import plane_rotations
 from vision.plane import LevelPlane, rotation_to_level, rotation_vector_xy, rotation_xy
 from vision.redness import ratio_table, red_mask
-from vision.refine import Fit, fit_profiles, usable_edges
+from vision.lines import Edges
+from vision.refine import Fit, fit_profiles
 from vision.rings import (
     Contours,
     Hypothesis,
@@ -149,6 +150,7 @@ class TargetDetector:
         self.min_share = _sigma("min_share", min_share, 1.0)
         self._R_cb = check_rotation(R_cb, "R_cb")
         self._edges = np.asarray(target.edges_m, dtype=np.float64)
+        self._edge_table = Edges.of(self._edges)
         self._margin_m = 0.5 * target.side_m - self._edges[0]
         self._tables = tuple(ratio_table(ratio) for ratio in (1.3, 1.8))
 
@@ -308,7 +310,7 @@ class TargetDetector:
         plane, hypothesis = candidate.plane, candidate.hypothesis
         unit = float(plane.units_per_pixel(hypothesis.centre[0], hypothesis.centre[1]))
         to_px = hypothesis.kappa / unit
-        usable = usable_edges(self._edges, to_px)
+        usable = self._edge_table.usable(to_px)
         sigma = (
             FREE_TILT_SIGMA_RAD
             if free
@@ -326,7 +328,7 @@ class TargetDetector:
                 plane,
                 hypothesis.centre,
                 hypothesis.kappa,
-                self._edges,
+                self._edge_table,
                 tilt_sigma_rad=tilt_sigma_rad,
                 tilt=candidate.tilt,
             )
@@ -492,7 +494,7 @@ def _judge_area(fit: Fit | None, covered: bool, min_share: float, max_blur_px: f
         return "a small red region, but not on white"
     if fit.contradicted > 0.0:
         return "a small red region whose rings have other radii"
-    if not (0.38 if covered else 0.28) < fit.blur_px < min(1.8, max_blur_px) or abs(fit.growth_px) > 0.35:
+    if not (0.38 if covered else 0.28) < fit.blur_px < min(1.8, max_blur_px) or abs(fit.growth_px) > 0.45:
         return "a small red region whose edges are not as sharp as the target's"
     if fit.chi2 < (MIN_GAIN_OVER_SMALL_DISC if few else MIN_GAIN_OVER_DISC):
         return "a small red disc without visible rings"

@@ -23,18 +23,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.lines import Edges, Lines, lay_lines
 from vision.plane import LevelPlane, rotation_xy
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-SAMPLES = 9
-"""Pixels on a line across an edge."""
-MIN_GAP_PX = 3.5
-"""Edges closer than this to their neighbour are left out of the line fit."""
-MIN_RADIUS_PX = 3.5
 GROWTH_SIGMA_PX = 0.3
 """Prior 1-sigma of the growth of red."""
+START_BLUR_PX = 0.65
+CLOSE_PX = 0.12
+"""Displacements below this are linear enough to need no second step."""
 _SQRT_2_OVER_PI = 0.7978845608028654
 INV_SQRT_2PI = 0.3989422804014327
 
@@ -78,47 +77,6 @@ class Fit:
     is_area: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Lines:
-    """Lines of pixels across edges: rays ``x``, ``y``, rows ``v``, ``weight`` and ``value`` less its mean
-    (p, m); the rest (p,)."""
-
-    x: Array
-    y: Array
-    v: Array
-    weight: Array
-    total: Array
-    value: Array
-    level: Array
-    red: Array
-    edge: NDArray[np.intp]
-    half_px: Array
-    u0: Array
-    v0: Array
-
-
-def edge_sides(n_edges: int) -> Array:
-    """Return +1 for the outside of red (even edges), -1 for the edge of a hole."""
-    return np.where(np.arange(n_edges) % 2 == 0, 1.0, -1.0)
-
-
-def edge_gaps(edges_m: Array) -> Array:
-    """Return the distance of each edge to its nearest neighbour (or, for the innermost, to the centre)
-    [m]."""
-    steps = -np.diff(edges_m)
-    return np.minimum(np.concatenate(([np.inf], steps)), np.concatenate((steps, [2.0 * edges_m[-1]])))
-
-
-def usable_edges(edges_m: Array, to_px: float) -> NDArray[np.bool_]:
-    """Return which edges can be measured one by one, at ``to_px`` pixels per metre."""
-    steps = -np.diff(edges_m) * to_px
-    outside = np.concatenate(([np.inf], steps))
-    inside = np.concatenate((steps, [2.0 * edges_m[-1] * to_px]))
-    near, far = np.minimum(outside, inside), np.maximum(outside, inside)
-    apart: NDArray[np.bool_] = (near > MIN_GAP_PX) | ((near > 0.7 * MIN_GAP_PX) & (far > 1.4 * MIN_GAP_PX))
-    return apart & (edges_m * to_px > MIN_RADIUS_PX)
-
-
 def phi(t: Array) -> Array:
     """Return the normal distribution function, to 3e-4 (Page's formula with tanh)."""
     return 0.5 + 0.5 * np.tanh(_SQRT_2_OVER_PI * t * (1.0 + 0.044715 * t * t))
@@ -130,118 +88,41 @@ def _median(values: Array) -> float:
     return float(np.partition(values, k)[k])
 
 
-def sample_lines(
-    image: Image, plane: LevelPlane, centre: Array, kappa: float, edges_m: Array, widen: float, n_lines: int
-) -> _Lines | None:
-    """Lay lines of pixels across the edges that lie inside the image; None where there are too few."""
-    to_px = kappa / float(plane.units_per_pixel(centre[0], centre[1]))
-    radius_px = to_px * edges_m
-    usable = np.flatnonzero(usable_edges(edges_m, to_px))
-    if not len(usable):
-        return None
-    want = np.clip(2.5 * radius_px[usable], 10.0, 30.0)
-    want *= min(1.0, n_lines / want.sum())
-    lines = None
-    for _ in range(2):
-        lines = _place(plane, centre, kappa, edges_m, usable, np.maximum(want, 6).astype(np.intp))
-        seen = len(lines[0]) / want.sum()
-        if seen > 0.6 or seen == 0.0:
-            break
-        want = want / max(seen, 0.15)
-    assert lines is not None
-    edge, u0, v0, du, dv, gap = lines
-    if len(edge) < 12:
-        return None
-    half = np.clip(0.6 * gap, 2.6, widen)
-    offset = np.linspace(-1.0, 1.0, SAMPLES)[None, :] * half[:, None]
-    u = np.rint(u0[:, None] + offset * du[:, None]).astype(np.intp)
-    v = np.rint(v0[:, None] + offset * dv[:, None]).astype(np.intp)
-    weight = np.ones(u.shape)
-    # The same pixel twice on a line says nothing new; pixels outside the image say nothing.
-    weight[:, 1:][(u[:, 1:] == u[:, :-1]) & (v[:, 1:] == v[:, :-1])] = 0.0
-    w, h = plane.camera.width - 1, plane.camera.height - 1
-    uc, vc = np.clip(u, 0, w), np.clip(v, 0, h)
-    weight[(uc != u) | (vc != v)] = 0.0
-    pixels = image[vc, uc].astype(np.float64)
-    value = 0.5 * (pixels[..., 0] + pixels[..., 1])
-    total = np.maximum(weight.sum(axis=1), 1.0)
-    level = (value * weight).sum(axis=1) / total
-    value -= level[:, None]
-    rows = vc.astype(np.float64)
-    x, y = plane.rays(uc.astype(np.float64), rows)
-    return _Lines(x, y, rows, weight, total, value, level, pixels[..., 2], edge, half, u0, v0)
-
-
-def _place(
-    plane: LevelPlane,
-    centre: Array,
-    kappa: float,
-    edges_m: Array,
-    usable: NDArray[np.intp],
-    count: NDArray[np.intp],
-) -> tuple[NDArray[np.intp], Array, Array, Array, Array, Array]:
-    edge = np.repeat(usable, count)
-    first = np.repeat(np.cumsum(count) - count, count)
-    angle = (np.arange(len(edge)) - first + 0.37 * edge) * (2.0 * np.pi / np.repeat(count, count))
-    r = kappa * edges_m[edge]
-    step = 0.002 * kappa * edges_m[0]
-    x, y = np.cos(angle), np.sin(angle)
-    rr = np.stack((r, r + step))
-    u, v = plane.to_pixels(centre[0] + rr * x, centre[1] + rr * y)
-    du, dv = u[1] - u[0], v[1] - v[0]
-    length = np.hypot(du, dv)
-    inside = plane.inside(u[0], v[0], 1.5)
-    gap = edge_gaps(edges_m)[edge] * kappa * length / step
-    du, dv = du / length, dv / length
-    if inside.all():
-        return edge, u[0], v[0], du, dv, gap
-    return edge[inside], u[0][inside], v[0][inside], du[inside], dv[inside], gap[inside]
-
-
 def fit_profiles(
     image: Image,
     plane: LevelPlane,
     centre: Array,
     kappa: float,
-    edges_m: Array,
+    edges: Edges,
     *,
     tilt_sigma_rad: float = 0.0,
     tilt: Array | None = None,
-    n_lines: int = 84,
-    iterations: int = 5,
-    start_blur_px: float = 0.7,
+    n_lines: int = 64,
 ) -> Fit | None:
-    """Fit centre, scale, blur and growth (and the plane's tilt, with a prior of ``tilt_sigma_rad``, if not
-    zero).
+    """Fit centre, scale, blur and growth (and the plane's tilt, with a prior of ``tilt_sigma_rad``, if not zero).
 
-    ``image`` BGR; ``centre`` (2,), ``kappa`` [1/m] the start, good to about 1.5 px at the edges. None where
-    too few edges are in view or the fit leaves the start.
+    ``image`` BGR; ``centre`` (2,), ``kappa`` [1/m] the start, good to about 1.5 px at the edges. None where too few
+    edges are in view or the fit leaves the start. ``tilt`` (2,) is the tilt that ``plane`` already has.
     """
-    lines = sample_lines(image, plane, centre, kappa, edges_m, 4.0, n_lines)
-    if lines is None:
-        return None
-    sides = edge_sides(len(edges_m))
-    start_tilt = np.zeros(2) if tilt is None else tilt
-    state = _State(plane, np.array(centre), float(kappa), start_tilt, start_blur_px, 0.0)
-    resampled = False
-    solved: _Solved | None = None
-    for i in range(iterations):
-        solved = _step(state, lines, edges_m, sides, tilt_sigma_rad, free_blur=i < iterations - 1)
+    state = _State(plane, centre, kappa, np.zeros(2) if tilt is None else tilt, START_BLUR_PX, 0.0)
+    free = [0, 1, 2, 5] if tilt_sigma_rad == 0.0 else [0, 1, 2, 3, 4, 5]
+    laid_blur = START_BLUR_PX
+    # A tilt of degrees is far from linear, a move of the centre by a pixel a little.
+    near_enough_px = 0.35 if tilt_sigma_rad == 0.0 else 0.04
+    for _ in range(8):
+        lines = lay_lines(image, state.plane, state.centre, state.kappa, edges, laid_blur, n_lines)
+        if lines is None:
+            return None
+        solved = _fit_lines(state, lines, free, tilt_sigma_rad)
         if solved is None:
             return None
-        done = solved.moved_px < 0.01 and i >= 1
-        wide = state.blur_px > 1.25 and lines.half_px.max() < 3.2 * state.blur_px
-        if not resampled and i < iterations - 2 and (wide or solved.moved_px > 1.0):
-            again = sample_lines(
-                image, state.plane, state.centre, state.kappa, edges_m, max(4.0, 3.2 * state.blur_px), n_lines
-            )
-            if again is None:
-                return None
-            lines, resampled, done = again, True, False
-        if done:
+        state.move(solved.moved)
+        if not (state.kappa > 0.0 and np.isfinite(state.centre).all()):
+            return None
+        if solved.moved_px < near_enough_px and max(state.blur_px, 1.1) < 1.25 * max(laid_blur, 1.1):
             break
-    assert solved is not None
-    return _result(state, solved, lines, edges_m)
+        laid_blur = state.blur_px
+    return _result(state, solved, lines, len(edges.radius_m), free)
 
 
 @dataclass(slots=True)
@@ -252,165 +133,184 @@ class _State:
     tilt: Array
     blur_px: float
     growth_px: float
+    blur_xy: Array | None = None
+    """The blur's covariance (uu, uv, vv) [px^2], where it differs with the direction."""
+
+    def move(self, change: Array) -> None:
+        """Apply a change of centre x, y, kappa, tilt x, y, growth."""
+        self.centre = self.centre + change[:2]
+        self.kappa += float(change[2])
+        self.growth_px += float(change[5])
+        if change[3] != 0.0 or change[4] != 0.0:
+            self.tilt = self.tilt + change[3:5]
+            self.plane = self.plane.tilted(rotation_xy(change[3], change[4]))
+
+    def blur_of(self, lines: Lines) -> Array:
+        """Return the blur on each line (p,) [px]."""
+        if self.blur_xy is None:
+            return np.full(len(lines.edge), self.blur_px)
+        uu, uv, vv = self.blur_xy
+        square = lines.nu * lines.nu * uu + lines.nu * lines.nv * uv + lines.nv * lines.nv * vv
+        return np.sqrt(np.clip(square, 0.09, 36.0))
 
 
 @dataclass(slots=True)
 class _Solved:
     inverse: Array
-    design: Array
-    considered: Array
     weight: Array
     residual: Array
     inlier: NDArray[np.bool_]
+    moved: Array
     moved_px: float
-    free: list[int]
     chi2_reduced: float
     contrast: float
 
 
-def _step(
-    state: _State, lines: _Lines, edges_m: Array, sides: Array, tilt_sigma_rad: float, free_blur: bool
-) -> _Solved | None:
-    plane, blur = state.plane, state.blur_px
-    k = lines.edge
-    s = sides[k]
-    x, y = lines.x, lines.y
-    qx, qy = plane.from_rays(x, y, lines.v)
-    ex, ey = qx - state.centre[0], qy - state.centre[1]
-    rho = np.sqrt(ex * ex + ey * ey)
-    # Gradient of rho in the image, at the middle of each line.
-    mid = SAMPLES // 2
-    r0 = rho[:, mid]
-    nx, ny = ex[:, mid] / r0, ey[:, mid] / r0
-    xm, ym, qxm, qym = x[:, mid], y[:, mid], qx[:, mid], qy[:, mid]
-    r = plane.rotation
-    depth = r[2, 0] * xm + r[2, 1] * ym + r[2, 2]
-    tangent = nx * qxm + ny * qym
-    gx = (nx * r[0, 0] + ny * r[1, 0] - tangent * r[2, 0]) / depth
-    gy = (nx * r[0, 1] + ny * r[1, 1] - tangent * r[2, 1]) / depth
-    slope = np.hypot(gx / plane.camera.fx, gy / plane.camera.fy)  # plane units per pixel along the normal
-    unit = slope * blur
-    rk = state.kappa * edges_m[k]
-    target = rk - unit * unit / (2.0 * rk) + s * (state.growth_px * slope)
-    t = (rho - target[:, None]) / unit[:, None]
-    gap = edge_gaps(edges_m)
-    near = bool((gap[k] * state.kappa / slope - lines.half_px < 3.0 * blur).any())
+def _fit_lines(state: _State, lines: Lines, free: list[int], tilt_sigma_rad: float) -> _Solved | None:
+    """Fit the parameters to one set of lines; ``state`` keeps its place, only its blur is updated."""
+    a = lines.design[:, free]
+    precision = np.zeros(len(free))
+    precision[-1] = 1.0 / GROWTH_SIGMA_PX**2
+    start = np.zeros(len(free))
+    start[-1] = state.growth_px
+    if len(free) == 6:
+        precision[3:5] = 1.0 / tilt_sigma_rad**2
+        start[3:5] = state.tilt
+    prior = np.diag(precision)
+    total = np.zeros(len(free))
+    # Growth is a parameter of the edges' places, which were laid without it.
+    total[-1] = state.growth_px
+    base = total.copy()
+    solved: _Solved | None = None
+    for i in range(5):
+        measured = _displacements(state, lines, a @ total, float(total[-1]), free_blur=i < 4)
+        if measured is None:
+            return None
+        delta, sigma2, valid, contrast, ratio = measured
+        pull = precision * (base - start - total)
+        solved = _least_squares(a, delta, sigma2, valid, prior, pull)
+        if solved is None:
+            return None
+        solved.contrast = contrast
+        total = total + solved.moved
+        step_px = float(np.abs(a @ solved.moved).max())
+        blur_before = state.blur_px
+        _update_blur(state, lines, ratio, solved.weight > 0.0)
+        if step_px < CLOSE_PX and 0.8 < state.blur_px / blur_before < 1.25:
+            break
+    assert solved is not None
+    change = np.zeros(6)
+    change[free] = total - base
+    solved.moved_px = float(np.abs(a[:, :-1] @ (total - base)[:-1]).max())
+    solved.moved = change
+    return solved
+
+
+def _displacements(
+    state: _State, lines: Lines, shift_px: Array, growth_px: float, free_blur: bool
+) -> tuple[Array, Array, NDArray[np.bool_], float, Array] | None:
+    """Measure each line's edge: displacement from ``shift_px`` [px], its variance, whether it is one at all.
+
+    Also returned: the contrast, and each line's change of the logarithm of the blur.
+    """
+    blur = state.blur_of(lines)
+    s = lines.side
+    per = (1.0 / blur)[:, None]
+    distance = lines.distance - (shift_px - blur * blur * lines.bend)[:, None]
+    t = distance * per
     bell = np.exp(-0.5 * t * t)
-    step_ = phi(t)
-    slope_ = bell
+    rise = phi(t)
     spread = t * bell
-    if near:
-        for side in (-1, 1):
-            j = k + side
-            has = (j >= 0) & (j < len(edges_m))
-            rj = state.kappa * edges_m[np.clip(j, 0, len(edges_m) - 1)]
-            tj = (rho - (rj - unit * unit / (2.0 * rj) - s * state.growth_px * slope)[:, None]) / unit[
-                :, None
-            ]
-            tj = np.where(has[:, None], tj, 9.0 * side)
+    if (lines.gap_px - lines.half_px < 3.0 * blur).any():
+        # The neighbours grow the other way, and bend by their own radius.
+        grown = (2.0 * growth_px) * s - blur * blur * lines.bend
+        for offset in (
+            grown - lines.outward_px + blur * blur * lines.outward_bend,
+            grown + lines.inward_px + blur * blur * lines.inward_bend,
+        ):
+            tj = np.clip((distance + offset[:, None]) * per, -9.0, 9.0)
             bj = np.exp(-0.5 * tj * tj)
-            step_ = step_ - phi(tj)
-            slope_ = slope_ - bj * (rj / rk)[:, None]
+            rise = rise - phi(tj)
+            bell = bell - bj
             spread = spread - tj * bj
-    w = lines.weight
-    basis = np.empty((len(k), 4, SAMPLES))
-    np.multiply(s[:, None], step_, out=basis[:, 0])
-    np.multiply((-INV_SQRT_2PI / blur) * s[:, None], slope_, out=basis[:, 1])
-    np.multiply(-INV_SQRT_2PI * s[:, None], spread, out=basis[:, 2])
+    basis = np.empty((len(s), 4, t.shape[1]))
+    np.multiply(s[:, None], rise, out=basis[:, 0])
+    np.multiply((-INV_SQRT_2PI * s)[:, None] * per, bell, out=basis[:, 1])
+    np.multiply((-INV_SQRT_2PI * s)[:, None], spread, out=basis[:, 2])
     basis[:, 3] = lines.value
-    total = lines.total
-    weighted = basis * w[:, None, :]
+    weighted = basis * lines.weight[:, None, :]
     # Sums of products about the means of each line: its level is eliminated.
     sums = weighted.sum(axis=2)
     gram = weighted @ basis.transpose(0, 2, 1)
-    gram -= (sums / total[:, None])[:, :, None] * sums[:, None, :]
+    gram -= (sums / np.maximum(lines.total, 1.0)[:, None])[:, :, None] * sums[:, None, :]
     power = gram[:, 3, 3]
-    if free_blur:
-        solution, inverse_11 = _solve3(gram)
-    else:
-        solution, inverse_11 = _solve2(gram)
-    contrast = solution[:, 0]
-    rest = power - (solution * gram[:, :3, 3]).sum(axis=1)
-    dof = np.maximum(total - (4.0 if free_blur else 3.0), 1.0)
+    solution, inverse_11 = _solve3(gram) if free_blur else _solve2(gram)
+    contrast = solution[0]
+    rest = power - (solution * gram[:, :3, 3].T).sum(axis=0)
+    dof = np.maximum(lines.total - 4.0, 1.0)
     variance = np.maximum(rest, 0.0) / dof
     middle = _median(contrast)
     if not middle > 4.0:
         return None
     noise = max(_median(variance), 0.08)
-    with np.errstate(all="ignore"):
-        delta = solution[:, 1] / contrast
-        sigma2 = np.maximum(variance, noise) * inverse_11 / (contrast * contrast)
-        valid = (contrast > max(4.0, 0.3 * middle)) & (rest < np.maximum(0.15 * power, 8.0 * noise * dof))
-        valid &= np.isfinite(delta) & (np.abs(delta) < lines.half_px) & (sigma2 < 1.0) & (total >= 5.0)
-    if valid.sum() < 10:
+    seen = np.maximum(contrast, 1.0)
+    delta = solution[1] / seen
+    sigma2 = np.maximum(variance, noise) * inverse_11 / (seen * seen)
+    valid = (contrast > max(4.0, 0.3 * middle)) & (rest < np.maximum(0.15 * power, 8.0 * noise * dof))
+    valid &= (np.abs(delta) < lines.half_px) & (sigma2 < 1.0) & (lines.total >= 5.0)
+    if np.count_nonzero(valid) < 10:
         return None
+    return delta, sigma2, valid, middle, solution[2] / seen
+
+
+def _least_squares(
+    a: Array, delta: Array, sigma2: Array, valid: NDArray[np.bool_], prior: Array, pull: Array
+) -> _Solved | None:
+    """Solve for the change of the parameters, robustly; lines that disagree lose their weight altogether."""
+    full = valid / (sigma2 + 1e-4)
     delta = np.where(valid, delta, 0.0)
-    sigma2 = np.where(valid, sigma2, 1.0)
-    # Rows: change of the displacement [px] with centre x, y, kappa, tilt x, y, growth.
-    design = np.empty((len(k), 6))
-    design[:, 0] = nx / slope
-    design[:, 1] = ny / slope
-    design[:, 2] = edges_m[k] / slope
-    design[:, 3] = (nx * qxm * qym + ny * (1.0 + qym * qym)) / slope
-    design[:, 4] = -(nx * (1.0 + qxm * qxm) + ny * qxm * qym) / slope
-    design[:, 5] = s
-    considered = np.empty((len(k), 3))
-    considered[:, 0] = (gx * xm + gy * ym) / slope
-    considered[:, 1] = gx / plane.camera.fx / slope
-    considered[:, 2] = gy / plane.camera.fy / slope
-    free = [0, 1, 2, 5] if tilt_sigma_rad == 0.0 else [0, 1, 2, 3, 4, 5]
-    prior = np.zeros((6, 6))
-    offset = np.zeros(6)
-    prior[5, 5] = 1.0 / GROWTH_SIGMA_PX**2
-    offset[5] = -state.growth_px
-    if tilt_sigma_rad > 0.0:
-        prior[3, 3] = prior[4, 4] = 1.0 / tilt_sigma_rad**2
-        offset[3:5] = -state.tilt
-    a = design[:, free]
-    prior_free = prior[np.ix_(free, free)]
-    pull = prior_free @ offset[free]
-    weight = valid / (sigma2 + 1e-4)
-    change = np.zeros(len(free))
-    residual = delta
-    for pass_ in range(3):
+    weight = full
+    for last in (False, False, True):
         aw = a * weight[:, None]
         try:
-            inverse = np.linalg.inv(aw.T @ a + prior_free)
+            inverse = np.linalg.inv(aw.T @ a + prior)
         except np.linalg.LinAlgError:
             return None
         change = inverse @ (aw.T @ delta + pull)
         residual = delta - a @ change
         size = np.abs(residual)
         scale = max(1.4826 * _median(size[valid]), 0.01)
-        if pass_ == 2:
+        if last:
             break
-        # Lines that disagree lose their weight altogether: they lie on something else.
         huber = np.minimum(1.0, 2.0 * scale / np.maximum(size, 1e-12))
-        huber[size > max(5.0 * scale, 0.1)] = 0.0
-        weight = valid * huber / (sigma2 + 1e-4)
+        weight = full * huber * (size < max(5.0 * scale, 0.1))
     inlier = valid & (size < max(5.0 * scale, 0.25))
-    used = weight > 0.0
-    n = int(used.sum())
+    n = np.count_nonzero(weight)
     if n < 10:
         return None
-    chi2 = float((weight[used] * residual[used] ** 2).sum()) / max(n - len(free), 1)
-    full = np.zeros(6)
-    full[free] = change
-    state.centre = state.centre + full[:2]
-    state.kappa += full[2]
-    state.growth_px += full[5]
-    if tilt_sigma_rad > 0.0:
-        state.tilt = state.tilt + full[3:5]
-        state.plane = plane.tilted(rotation_xy(full[3], full[4]))
-    if free_blur:
-        with np.errstate(all="ignore"):
-            ratio = _median((solution[:, 2] / contrast)[used])
-        if np.isfinite(ratio):
-            state.blur_px = float(np.clip(blur * np.exp(np.clip(ratio, -0.5, 0.5)), 0.3, 6.0))
-    if not (state.kappa > 0.0 and np.isfinite(state.centre).all()):
-        return None
-    moved = float(np.abs(a @ change).max())
-    return _Solved(inverse, design, considered, weight, residual, inlier, moved, free, chi2, middle)
+    chi2 = float(weight @ (residual * residual)) / max(n - len(change), 1)
+    return _Solved(inverse, weight, residual, inlier, change, 0.0, chi2, 0.0)
+
+
+def _update_blur(state: _State, lines: Lines, ratio: Array, used: NDArray[np.bool_]) -> None:
+    """Move the blur by what the lines say; a blur that is not small may differ with the direction (motion)."""
+    step = np.clip(ratio, -0.5, 0.5)
+    state.blur_px = min(6.0, max(0.3, state.blur_px * float(np.exp(_median(step[used])))))
+    if state.blur_px < 0.85:
+        state.blur_xy = None
+        return
+    square = (state.blur_of(lines) * np.exp(step))[used] ** 2
+    nu, nv = lines.nu[used], lines.nv[used]
+    columns = np.stack((nu * nu, nu * nv, nv * nv), axis=1)
+    keep = np.ones(len(square), dtype=np.bool_)
+    for _ in range(2):
+        if keep.sum() < 10:
+            return
+        found = np.linalg.lstsq(columns[keep], square[keep], rcond=None)[0]
+        off = np.abs(square - columns @ found)
+        keep = off < 3.0 * _median(off) + 1e-6
+    if np.isfinite(found).all():
+        state.blur_xy = found
 
 
 def _solve3(gram: Array) -> tuple[Array, Array]:
@@ -426,7 +326,7 @@ def _solve3(gram: Array) -> tuple[Array, Array]:
     x = np.stack(
         (c00 * h0 + c01 * h1 + c02 * h2, c01 * h0 + c11 * h1 + c12 * h2, c02 * h0 + c12 * h1 + c22 * h2)
     )
-    return (x / determinant).T, c11 / determinant
+    return x / determinant, c11 / determinant
 
 
 def _solve2(gram: Array) -> tuple[Array, Array]:
@@ -436,17 +336,16 @@ def _solve2(gram: Array) -> tuple[Array, Array]:
     determinant = np.where(determinant > 1e-12 * a * d, determinant, np.inf)
     h0, h1 = gram[:, 0, 3], gram[:, 1, 3]
     x = np.stack((d * h0 - b * h1, a * h1 - b * h0, np.zeros_like(a)))
-    return (x / determinant).T, a / determinant
+    return x / determinant, a / determinant
 
 
-def _result(state: _State, solved: _Solved, lines: _Lines, edges_m: Array) -> Fit:
-    free = solved.free
-    a = solved.design[:, free]
+def _result(state: _State, solved: _Solved, lines: Lines, n_edges: int, free: list[int]) -> Fit:
+    a = lines.design[:, free]
     weight = solved.weight
     aw = a * weight[:, None]
     # Scatter of the displacements about the model scales the covariance, up and down.
     covariance_free = solved.inverse * solved.chi2_reduced
-    gain = -solved.inverse @ (aw.T @ solved.considered)
+    gain = -solved.inverse @ (aw.T @ lines.considered)
     rows = [i for i in free if i < 5]
     keep = [n for n, i in enumerate(free) if i < 5]
     covariance = np.zeros((5, 5))
@@ -454,8 +353,8 @@ def _result(state: _State, solved: _Solved, lines: _Lines, edges_m: Array) -> Fi
     considered = np.zeros((5, 3))
     considered[rows] = gain[keep]
     inlier = solved.inlier
-    laid = np.bincount(lines.edge, minlength=len(edges_m))
-    agreeing = np.bincount(lines.edge, weights=inlier, minlength=len(edges_m))
+    laid = np.bincount(lines.edge, minlength=n_edges)
+    agreeing = np.bincount(lines.edge, weights=inlier, minlength=n_edges)
     seen = np.flatnonzero(agreeing > 0.4 * laid)
     inner = inlier & (lines.edge > 0)
     wv = (lines.weight * lines.value)[inner]
