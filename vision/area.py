@@ -24,6 +24,7 @@ GROWTH_SIGMA_PX = 0.25
 BLUR_LOG_SIGMA = 0.4
 START_BLUR_PX = 0.62
 MAX_PIXELS = 1600
+CLIPPED = 253.0
 MAX_MISFIT = 0.2
 """Residual, as a share of the contrast, beyond which the rough fit is not refined."""
 
@@ -65,6 +66,10 @@ def _patch(image: Image, plane: LevelPlane, centre: Array, radius: float, border
     uu, vv = uu.ravel(), vv.ravel()
     x, y = plane.rays(uu, vv)
     pixels = image[vv, uu].astype(np.float64)
+    # What has clipped says only that it was brighter.
+    open_ = pixels[:, :2].max(axis=1) < CLIPPED
+    if 0.3 < open_.mean() < 1.0:
+        uu, vv, x, y, pixels = uu[open_], vv[open_], x[open_], y[open_], pixels[open_]
     return _Patch(uu, vv, x, y, 0.5 * (pixels[:, 0] + pixels[:, 1]), pixels[:, 2])
 
 

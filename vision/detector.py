@@ -421,9 +421,10 @@ class TargetDetector:
         inner[1, 1] += (self.model_error_px * unit) ** 2
         inner[2, 2] += (self.model_error_px * kappa / radius_px) ** 2
         covariance = jacobian @ inner @ jacobian.T
-        sigmas = (self.focal_sigma, self.principal_point_sigma_px, self.principal_point_sigma_px)
-        shifts = jacobian @ fit.considered * sigmas
-        covariance += shifts @ shifts.T
+        if self.focal_sigma > 0.0 or self.principal_point_sigma_px > 0.0:
+            sigmas = (self.focal_sigma, self.principal_point_sigma_px, self.principal_point_sigma_px)
+            shifts = jacobian @ fit.considered * sigmas
+            covariance += shifts @ shifts.T
         if known_attitude and self.attitude_sigma_rad > 0.0:
             turn = skew(position)
             covariance += self.attitude_sigma_rad**2 * (turn @ turn.T)

@@ -97,7 +97,7 @@ def fit_profiles(
     *,
     tilt_sigma_rad: float = 0.0,
     tilt: Array | None = None,
-    n_lines: int = 64,
+    n_lines: int = 54,
 ) -> Fit | None:
     """Fit centre, scale, blur and growth (and the plane's tilt, with a prior of ``tilt_sigma_rad``, if not zero).
 
@@ -280,7 +280,8 @@ def _least_squares(
         residual = delta - a @ change
         size = np.abs(residual)
         scale = max(1.4826 * _median(size[valid]), 0.01)
-        if last:
+        largest = float(size[valid].max())
+        if last or largest < 2.5 * scale:
             break
         huber = np.minimum(1.0, 2.0 * scale / np.maximum(size, 1e-12))
         weight = full * huber * (size < max(5.0 * scale, 0.1))
@@ -357,15 +358,17 @@ def _result(state: _State, solved: _Solved, lines: Lines, n_edges: int, free: li
     agreeing = np.bincount(lines.edge, weights=inlier, minlength=n_edges)
     seen = np.flatnonzero(agreeing > 0.4 * laid)
     inner = inlier & (lines.edge > 0)
-    wv = (lines.weight * lines.value)[inner]
-    slope = float((wv * lines.red[inner]).sum() / max(float((wv * lines.value[inner]).sum()), 1e-9))
+    wv = (lines.weight * lines.value)[inner].ravel()
+    slope = float(wv @ lines.red[inner].ravel()) / max(float(wv @ lines.value[inner].ravel()), 1e-9)
     contradicted = 0.0
     if not inlier.all() and inlier.any():
         white = _median(lines.level[inlier]) + 0.5 * solved.contrast
         flat = np.abs(lines.value).max(axis=1) < 0.2 * solved.contrast
         plain = flat & (np.abs(lines.level - white) < 0.15 * solved.contrast) & (lines.level < 248.0)
         contradicted = float((plain & ~inlier).mean())
-    rms = float(np.sqrt(np.mean(solved.residual[inlier] ** 2))) if inlier.any() else float("inf")
+    n_inlier = int(np.count_nonzero(inlier))
+    misses = solved.residual[inlier]
+    rms = float(np.sqrt(misses @ misses / n_inlier)) if n_inlier else float("inf")
     return Fit(
         state.plane,
         state.centre,
@@ -374,12 +377,12 @@ def _result(state: _State, solved: _Solved, lines: Lines, n_edges: int, free: li
         covariance,
         considered,
         rms,
-        float(inlier.mean()),
+        n_inlier / len(inlier),
         tuple(seen.tolist()),
         state.blur_px,
         state.growth_px,
         solved.chi2_reduced,
-        int(inlier.sum()),
+        n_inlier,
         int((laid > 0).sum()),
         3 in free,
         np.stack((lines.u0, lines.v0), axis=1),
