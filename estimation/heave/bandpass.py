@@ -46,6 +46,11 @@ class BandPass:
         return len(self.f)
 
     @property
+    def parameters(self) -> Array:
+        """Gain of each block, then the sections' w [rad/s], then their zeta: (7,) for one block of three."""
+        return np.concatenate([self.l.max(axis=0), self.omega_radps, self.zeta])
+
+    @property
     def sd_m(self) -> float:
         """Standard deviation of the heave [m]."""
         return math.sqrt(float(self.heave_row @ self.stationary @ self.heave_row))

@@ -58,6 +58,14 @@ def test_gain_is_zero_at_rest_and_rate_is_the_derivative() -> None:
     assert np.all(np.linalg.eigvals(block.f).real < 0)
 
 
+def test_parameters_describe_the_density() -> None:
+    block = heave.fit_band_pass(FREQUENCY, sea(), NOISE)
+    gain, omega, zeta = block.parameters[0], block.parameters[1:4], block.parameters[4:7]
+    s = 2j * np.pi * FREQUENCY[:, None]
+    response = gain * np.prod(s / (s**2 + 2 * zeta * omega * s + omega**2), axis=1)
+    assert block.density(FREQUENCY) == pytest.approx(2 * np.abs(response) ** 2, rel=1e-9)
+
+
 def test_swell_and_wind_sea_together() -> None:
     both = sea(0.3, 0.02) + sea(0.1, 0.01)
     block = heave.fit_band_pass(FREQUENCY, both, NOISE, blocks=2)
