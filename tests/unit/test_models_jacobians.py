@@ -11,7 +11,9 @@ from estimation import models
 from estimation import parameters as par
 from estimation.config import parse_config
 from estimation.consistency import check_jacobian
+from estimation.deck import deck_output
 from estimation.frames import (
+    R_CB_NOMINAL,
     Array,
     ned_to_geodetic,
     quat_exp,
@@ -20,10 +22,8 @@ from estimation.frames import (
 )
 from estimation.parameters import Site, pack_parameters
 from estimation.state import (
-    ACCEL_BIAS,
     ATTITUDE,
     BA0,
-    BARO_BIAS,
     BB0,
     BG0,
     BP0,
@@ -31,7 +31,14 @@ from estimation.state import (
     GYRO_BIAS,
     NOMINAL_SIZE,
     P0,
+    PH0,
+    PL0,
+    PLATFORM_HEAVE,
+    PLATFORM_OFFSET,
+    PLATFORM_SWAY,
+    PO0,
     POSITION,
+    PS0,
     Q0,
     V0,
     VELOCITY,
@@ -51,11 +58,15 @@ use = "fuse"
 use = true
 lever_arm_m = [0.05, 0.1, 0.15]
 surface_height_m = 0.7
+[platform]
+use = true
 """
 )
 LAYOUT = Layout.of(CONFIG)
 P = pack_parameters(CONFIG, SITE)
 NO_COVARIANCE = np.full(6, np.nan)
+HEAVE = np.array([0.4, 0.9, 1.3, 1.1, 0.3, 0.4, 0.5])
+"""Gain, three angular frequencies and three dampings of a heaving deck."""
 
 numbers = st.floats(-1.0, 1.0)
 vectors = st.tuples(numbers, numbers, numbers).map(np.array)
@@ -71,6 +82,10 @@ def state(position: Array, velocity: Array, rotation: Array, biases: Array, leve
     x[BA0 : BA0 + 3] = 0.1 * biases[::-1]
     x[BP0 : BP0 + 3] = biases
     x[BB0] = biases[0]
+    x[PO0 : PO0 + 2] = 2.0 * position[:2]
+    x[PS0 : PS0 + 4] = 0.3 * np.concatenate([velocity, biases[:1]])
+    x[PL0] = 0.5 * biases[1]
+    x[PH0 : PH0 + 6] = 0.4 * np.concatenate([position, velocity])
     return x
 
 
@@ -86,7 +101,7 @@ def test_transition(x: Array, rate: Array, force: Array, dt: float) -> None:
     F, Q, unused = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
 
     def step(start: Array, F: Array = unused, Q: Array = unused) -> Array:
-        return models.transition(start, gyro, accel, dt, scatter, P, LAYOUT.offsets, F, Q)
+        return models.transition(start, gyro, accel, dt, scatter, P, LAYOUT.offsets, F, Q, HEAVE)
 
     end = step(x, F, Q)
     numeric = np.empty((n, n))
@@ -99,7 +114,7 @@ def test_transition(x: Array, rate: Array, force: Array, dt: float) -> None:
         numeric[:, j] = (ahead - behind) / (2.0 * h)
     np.testing.assert_allclose(F, numeric, atol=2e-8)
     names = LAYOUT.offsets
-    for block in (POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS, GPS_BIAS, BARO_BIAS):
+    for block in (POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, GPS_BIAS, PLATFORM_SWAY, PLATFORM_HEAVE):
         assert np.any(F[:, names[block]] != 0.0)
 
 
@@ -115,12 +130,15 @@ def test_process_noise_composes(x: Array, dt: float) -> None:
     parts = []
     for step in (dt, 0.5 * dt):
         F, Q = np.empty((n, n)), np.empty((n, n))
-        models.transition(x, still, still, step, scatter, P, LAYOUT.offsets, F, Q)
+        models.transition(x, still, still, step, scatter, P, LAYOUT.offsets, F, Q, HEAVE)
         parts.append((F, Q))
     (_, whole), (F, half) = parts
     sum_of_halves = F @ half @ F.T + half
     np.testing.assert_allclose(sum_of_halves[:9, :9], whole[:9, :9], rtol=2e-6, atol=1e-15)
-    np.testing.assert_allclose(np.diag(sum_of_halves), np.diag(whole), rtol=2e-6)
+    vehicle = LAYOUT.offsets[PLATFORM_OFFSET]
+    np.testing.assert_allclose(np.diag(sum_of_halves)[:vehicle], np.diag(whole)[:vehicle], rtol=2e-6)
+    # The deck's oscillators are discretised by Simpson's rule.
+    np.testing.assert_allclose(sum_of_halves[vehicle:, vehicle:], whole[vehicle:, vehicle:], atol=1e-9)
     assert np.linalg.eigvalsh(whole).min() >= -1e-18
 
 
@@ -204,6 +222,27 @@ def test_magnetometer_noise_does_not_reach_the_tilt() -> None:
         assert r[0] == pytest.approx(-noise)
         tilts.append(H[0, att : att + 2].copy())
     np.testing.assert_allclose(tilts[0], tilts[1], atol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(states, vectors, vectors)
+def test_vision(x: Array, gyro: Array, off: Array) -> None:
+    """With no mount error and no age: about these the Jacobian is made."""
+    there = np.array([x[PO0] + x[PS0], x[PO0 + 1] + x[PS0 + 2], -x[PL0] - x[PH0 + 5]]) - x[P0 : P0 + 3]
+    seen = R_CB_NOMINAL @ (quat_to_matrix(x[Q0 : Q0 + 4]).T @ there)
+    measured(models.VISION, six(*(seen + off)), 3.0 * gyro, x)
+
+
+@settings(max_examples=10, deadline=None)
+@given(states)
+def test_what_is_said_of_the_deck(x: Array) -> None:
+    y, A = deck_output(x, HEAVE, LAYOUT.offsets, LAYOUT.size)
+    h = 1e-4
+    for j in range(LAYOUT.size):
+        error = np.zeros(LAYOUT.size)
+        error[j] = h
+        moved = deck_output(plus(x, error, LAYOUT.offsets), HEAVE, LAYOUT.offsets, LAYOUT.size)[0]
+        np.testing.assert_allclose(A[:, j], (moved - y) / h, atol=1e-8)
 
 
 def test_right_jacobian_is_the_derivative_of_exp() -> None:
