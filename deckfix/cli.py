@@ -20,6 +20,11 @@ from deckfix._version import __version__
 from deckfix.cli_detect import detect
 from deckfix.cli_vision import calibrate, target
 
+# The matrices here are small: threads of the linear algebra library only wait for each other. It reads this when
+# numpy is first imported, which no module above does.
+for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
 _ENGINE = click.option(
     "--engine", type=click.Choice(["auto", "filterpy", "compiled"]), default="auto", show_default=True,
     help="auto takes compiled where numba is installed.",

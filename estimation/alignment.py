@@ -37,20 +37,20 @@ from estimation.state import (
     BARO_BIAS,
     BB0,
     BG0,
+    CAMERA_LATENCY,
+    CAMERA_MOUNT,
     GPS_BIAS,
     GYRO_BIAS,
     P0,
-    POSITION,
-    Q0,
-    V0,
-    VELOCITY,
-    CAMERA_LATENCY,
-    CAMERA_MOUNT,
     PLATFORM_HEAVE,
     PLATFORM_LEVEL,
     PLATFORM_OFFSET,
     PLATFORM_SWAY,
+    POSITION,
+    Q0,
     RANGE_SCALE,
+    V0,
+    VELOCITY,
     Layout,
     nominal_zero,
 )
@@ -78,6 +78,12 @@ UNKNOWN_PLACE_M = 1000.0
 """1-sigma of the platform's place before it is seen, where no anchor is configured [m]."""
 UNKNOWN_LEVEL_M = 100.0
 """1-sigma of the platform's height before it is seen [m]."""
+FRESH_ATTITUDE_NS = 200_000_000
+"""Oldest attitude of another estimator that a start may use."""
+QUIET_RADPS = 0.2
+"""Fastest mean rotation in which a start in flight trusts the horizon [rad/s]."""
+QUIET_MPS2 = 0.8
+"""Largest horizontal acceleration in which it does [m/s^2]."""
 FRESH_NS = 1_200_000_000
 """Oldest GPS, magnetometer or attitude that a start may use."""
 
@@ -297,22 +303,31 @@ class Aligner:
         sigma = c.initialisation.yaw_sigma_rad
         force = window[:, 3:].mean(axis=0)
         gravity = normal_gravity(site.origin[0], site.origin[2])
-        if not rest and self._attitude is not None and t - self._attitude[0] < FRESH_NS:
-            return self._attitude[1], sigma, "in flight, from the autopilot's attitude"
-        up = np.array([0.0, 0.0, -gravity]) if rest else self._acceleration() - [0.0, 0.0, gravity]
+        stated = self._stated_attitude(t, window)
+        if not rest and stated is not None:
+            return stated, sigma, "in flight, from the autopilot's attitude"
+        acceleration = np.zeros(3) if rest else self._acceleration()
+        up = acceleration - np.array([0.0, 0.0, gravity])
         where = "at rest" if rest else "in flight"
         if self._mag is not None:
             if t - self._mag[0] > FRESH_NS:
                 return None
+            # A tilt error turns the level field by its dip's tangent: only a quiet moment will do for a start.
+            turning = float(np.linalg.norm(window[:, :3].mean(axis=0))) > QUIET_RADPS
+            if not rest and (turning or float(np.linalg.norm(acceleration[:2])) > QUIET_MPS2):
+                return None
             yaw = 0.0
             q = _attitude_from(force, up, yaw)
-            for _ in range(4):
+            for _ in range(12):
                 m = quat_to_matrix(q) @ self._mag[1]
                 yaw = wrap_pi(yaw + site.declination_rad - math.atan2(m[1], m[0]))
                 q = _attitude_from(force, up, yaw)
-            return q, sigma, f"{where}, heading from the magnetometer"
-        if self._attitude is not None and t - self._attitude[0] < FRESH_NS:
-            yaw = float(quat_to_euler(self._attitude[1])[2])
+            m = quat_to_matrix(q) @ self._mag[1]
+            dip = abs(m[2]) / max(1e-9, math.hypot(m[0], m[1]))
+            tilt = 0.0 if rest else c.initialisation.flight_tilt_sigma_rad
+            return q, min(0.5, math.hypot(sigma, dip * tilt)), f"{where}, heading from the magnetometer"
+        if stated is not None:
+            yaw = float(quat_to_euler(stated)[2])
             return _attitude_from(force, up, yaw), sigma, f"{where}, heading from the autopilot's attitude"
         found = self._heading_from_motion()
         if found is None or found[1] > c.initialisation.motion_yaw_sigma_rad or self._level is None:
@@ -320,6 +335,15 @@ class Aligner:
         turn = euler_to_quat(0.0, 0.0, found[0])
         q = quat_normalise(quat_multiply(turn, self._level))
         return q, max(sigma, 1.5 * found[1]), "in flight, heading from horizontal acceleration"
+
+    def _stated_attitude(self, t: int, window: Array) -> Array | None:
+        """Return another estimator's attitude, turned on to ``t`` with the gyro, if it is fresh."""
+        if self._attitude is None or t - self._attitude[0] > FRESH_ATTITUDE_NS:
+            return None
+        span = (t - self._attitude[0]) * 1e-9
+        count = max(1, sum(s[0] > self._attitude[0] for s in self._imu))
+        turn = window[-count:, :3].mean(axis=0) * span
+        return quat_normalise(quat_multiply(self._attitude[1], quat_exp(turn)))
 
     def _acceleration(self) -> Array:
         """Return the mean NED acceleration over the window, from GPS velocities."""
@@ -393,7 +417,6 @@ class Aligner:
         memory = np.zeros((self.sensors, MEMORY_SIZE))
         clock = np.array([t, t, t], dtype=np.int64)
         return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(3), memory, heave)
-
 
     def _put_platform(self, P: Array) -> Array:
         """Write what is known of the platform before it is seen into P; return its heave parameters."""

@@ -22,8 +22,8 @@ from numba.extending import overload, register_jitable
 
 from estimation import deck, frames, models, parameters, state, update
 from estimation import rows as rows_module
-from estimation.frames import Array
 from estimation.deck import deck_output, seen_height
+from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
 from estimation.outcome import Outcome
 from estimation.rows import (
@@ -361,8 +361,8 @@ register_jitable(_fuse)
 
 def _advance(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, heave: Array, p: Array,
-    offsets: Offsets, span: Int, ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array, out_sigma: Array,
-    out_covariance: Array, out_deck: Array, out_deck_covariance: Array, count: int, emit_after_ns: int, period_ns: int,
+    offsets: Offsets, span: Int, ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array,
+    out_sigma: Array, out_covariance: Array, out_deck: Array, out_deck_covariance: Array, count: int, emit_after_ns: int, period_ns: int,
 ) -> int:  # fmt: skip
     n = P.shape[0]
     F = np.empty((n, n))
@@ -387,8 +387,8 @@ def _advance(
             gyro = interpolate(imu0, clock[1], imu, t_imu, t)[:3]
             t_s = (t - clock[2]) * 1e-9
             ints[i, OUTCOME], ints[i, RESET], state = _fuse(
-                state, P, memory[ints[i, SENSOR]], scatter, ints[i, KIND], floats[i, VALUE:OWN], floats[i, OWN:RESULT], gyro, t_s,
-                ints[i, LATE], p, offsets, H, floats[i, RESULT:],
+                state, P, memory[ints[i, SENSOR]], scatter, ints[i, KIND], floats[i, VALUE:OWN],
+                floats[i, OWN:RESULT], gyro, t_s, ints[i, LATE], p, offsets, H, floats[i, RESULT:],
             )  # fmt: skip
             continue
         scatter_update(scatter, imu0, imu, (t - clock[1]) * 1e-9)
@@ -449,6 +449,6 @@ class CompiledEngine:
         s = self.state
         out.count = _kernel(
             s.clock, s.x, s.P, s.imu, s.scatter, s.memory, s.heave, self.p, self.layout.offsets, self.span,
-            rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.deck, out.deck_covariance, out.count, emit_after_ns,
-            period_ns,
+            rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.deck,
+            out.deck_covariance, out.count, emit_after_ns, period_ns,
         )  # fmt: skip

@@ -205,22 +205,27 @@ class VisionConfig(_Table, frozen=True):
     """Vision fixes of the target (P^c); used where the platform is."""
 
     latency_s: Annotated[
-        float, Meta(ge=0.0, le=0.15, description="age of a fix at its stamp, as calibrated", extra={"unit": "s"})
+        float,
+        Meta(ge=0.0, le=0.15, description="age of a fix at its stamp, as calibrated", extra={"unit": "s"}),
     ] = 0.0
     latency_sigma_s: Annotated[
         float, _positive("1-sigma of that age; the state that learns it stays within 0 to 0.15 s", "s")
     ] = 0.02
-    latency_walk: Annotated[float, _not_negative("random walk of the age; 3e-5: 0.1 ms after 10 s", "s/rts")] = 3e-5
+    latency_walk: Annotated[
+        float, _not_negative("random walk of the age; 3e-5: 0.1 ms after 10 s", "s/rts")
+    ] = 3e-5
     latency_rate_radps: Annotated[
         float,
-        _positive("rotation (rms over 5 s) below which the age is not learned, only its doubt carried", "rad/s"),
+        _positive(
+            "rotation (rms over 5 s) below which the age is not learned, only its doubt carried", "rad/s"
+        ),
     ] = 0.035
     angle_sigma_rad: Annotated[
         float, _positive("1-sigma across the line of sight, where a fix states no covariance", "rad")
-    ] = 0.004
+    ] = 0.0035
     range_sigma: Annotated[
         float, _positive("1-sigma along the line of sight as a share of the range, where none is stated", "-")
-    ] = 0.012
+    ] = 0.01
     floor_m: Annotated[float, _positive("1-sigma added to every fix, stated or not", "m")] = 0.01
     scale_sigma: Annotated[
         float, _positive("1-sigma of the range scale (focal length, size of the target)", "-")
@@ -243,7 +248,9 @@ class PlatformConfig(_Table, frozen=True):
     ] = 0.01
     anchor_radius_m: Annotated[
         float | None,
-        _number("r_plat: 1-sigma of the place about the configured origin; None: known from vision only", "m"),
+        _number(
+            "r_plat: 1-sigma of the place about the configured origin; None: known from vision only", "m"
+        ),
     ] = None
     sway_sigma_m: Annotated[float, _positive("stationary 1-sigma of the sway, per axis", "m")] = 0.1
     sway_period_s: Annotated[float, _positive("period of the sway", "s")] = 6.0
@@ -251,7 +258,9 @@ class PlatformConfig(_Table, frozen=True):
     level_walk: Annotated[
         float, _not_negative("random walk of the mean height (tide, drift); 0.01: 0.03 m after 10 s", "m/rts")
     ] = 0.01
-    heave_sigma_m: Annotated[float, _positive("stationary 1-sigma of the heave before it is learned", "m")] = 0.3
+    heave_sigma_m: Annotated[
+        float, _positive("stationary 1-sigma of the heave before it is learned", "m")
+    ] = 0.3
     heave_period_s: Annotated[float, _positive("period of the heave before it is learned", "s")] = 6.0
     heave_damping: Annotated[float, _positive("damping of the heave before it is learned", "-")] = 0.4
     learn_s: Annotated[

@@ -66,7 +66,9 @@ def heave_stationary(heave: Array) -> Array:
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def deck_transition(x: Array, y: Array, dt: float, p: Array, heave: Array, offsets: Offsets, F: Array, Q: Array) -> None:
+def deck_transition(
+    x: Array, y: Array, dt: float, p: Array, heave: Array, offsets: Offsets, F: Array, Q: Array
+) -> None:
     """Propagate the platform's blocks from ``x`` into ``y`` over ``dt`` [s]; fill their places in F and Q.
 
     The oscillators' transition is a series to third order in dt, the noise Simpson's rule over the step: both good to
@@ -110,7 +112,9 @@ def _fill(
         value = 0.0
         for c in range(n):
             value += F[start + i, start + c] * x[place + c]
-            Q[start + i, start + c] = dt / 6.0 * (drive[i] * drive[c] + 4.0 * middle[i] * middle[c] + end[i] * end[c])
+            Q[start + i, start + c] = (
+                dt / 6.0 * (drive[i] * drive[c] + 4.0 * middle[i] * middle[c] + end[i] * end[c])
+            )
         y[place + i] = value
 
 
@@ -130,7 +134,9 @@ def _series(f: Array, v: Array, t: float) -> Array:
     return total
 
 
-def vision(value: Array, own: Array, x: Array, gyro: Array, p: Array, offsets: Offsets, r: Array, H: Array, R: Array) -> int:
+def vision(
+    value: Array, own: Array, x: Array, gyro: Array, p: Array, offsets: Offsets, r: Array, H: Array, R: Array
+) -> int:
     """The target in the camera: P^c = (1 + s) R_cb exp(m)' (R_nb' (P_platform - P) - l), mount error m, scale s.
 
     The age's Jacobian is its rotational part only, [b]x w with b the target in the body: its translational part

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.alignment import Aligner
-from estimation.clockbank import ClockBank
+from estimation.clockbank import ClockBank, ClockSummary
 from estimation.config import Config, ConfigError
 from estimation.events import (
     AUTOPILOT,
@@ -29,7 +29,9 @@ from estimation.events import (
 )
 from estimation.filter import Model
 from estimation.frames import Array
+from estimation.heave.model import HeaveModel
 from estimation.history import Engine, History
+from estimation.learning import HeaveLearner
 from estimation.outcome import Outcome
 from estimation.parameters import Site, pack_parameters
 from estimation.rows import HEAVE_MODEL, PENDING, Estimates, FilterState, Int, Rows
@@ -55,12 +57,20 @@ RECORD_DTYPE = np.dtype(
 index, ``Outcome``, degrees of freedom, NIS, innovation with its predicted 1-sigma (NaN where there was no
 comparison), and the age at arrival."""
 
+MAX_RATE_RADPS = 100.0
+MAX_FORCE_MPS2 = 1000.0
+"""No inertial sensor of a multirotor reads beyond these: such a sample is rejected as outside the gate."""
 REWIND_SPAN_NS = 200_000_000
 REWIND_COUNT = 20
 """An inertial clock has gone back when this many samples over this span all are too old."""
 
 LOOK_AHEAD = 1024
 """Events that a batch is looked through at a time."""
+
+LOOK_AHEAD_LEARNING = 32
+"""The same where the heave is learned on the way."""
+TAKE_UP_NS = 600_000_000
+"""How long after its fixes are final a heave model is taken up by the filter."""
 
 MEASURED_3D = (Kind.GPS_POSITION, Kind.GPS_VELOCITY, Kind.VISION)
 
@@ -110,7 +120,10 @@ class Run:
 
     ``t_ns`` inertial clock; ``position_m``, ``velocity_mps`` (n, 3) NED; ``quaternion`` (n, 4) body to NED;
     ``covariance`` (n, 9, 9) of position, velocity and attitude error (body frame); ``gyro_bias``, ``accel_bias``
-    (n, 3); ``nominal`` (n, 40) and ``sigma`` (n, k) with ``state_names`` and ``state_units``. ``records`` has
+    (n, 3); ``deck`` (n, 8) what ``estimation.deck.deck_output`` gives with ``deck_covariance`` (n, 8, 8), of no columns
+    where the platform is off; ``heave`` the heave models, each with the time of its last fix;
+    ``clocks`` every other clock against the inertial one; ``nominal`` (n, NOMINAL_SIZE) and ``sigma`` (n, k) with
+    ``state_names`` and ``state_units``. ``records`` has
     ``RECORD_DTYPE``; ``sensors`` are the names that its indices mean; ``notes`` are (t_ns, sentence).
     ``imu_outcomes`` counts the inertial samples. ``origin`` is latitude [rad], longitude [rad], altitude [m], or
     None where the filter never started; ``missing`` says then what it waited for.
@@ -128,6 +141,10 @@ class Run:
     sigma: Array
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
+    deck: Array
+    deck_covariance: Array
+    heave: list[tuple[int, HeaveModel]]
+    clocks: list[ClockSummary]
     records: NDArray[np.void]
     sensors: tuple[str, ...]
     notes: list[tuple[int, str]]
@@ -166,6 +183,8 @@ class LandingEstimator:
     _settled: list[Rows] = field(default_factory=list)
     _notes: list[tuple[int, str]] = field(default_factory=list)
     _imu_outcomes: dict[Outcome, int] = field(default_factory=dict)
+    _learner: HeaveLearner | None = None
+    _heave: list[tuple[int, HeaveModel]] = field(default_factory=list)
     _utc_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -186,7 +205,16 @@ class LandingEstimator:
         latency[Kind.RANGEFINDER] = c.rangefinder.latency_s
         latency[Kind.VISION] = c.vision.latency_s
         self._latency = np.round(latency * 1e9)
+        if c.platform.use and c.platform.learn_s > 0.0:
+            self._learner = HeaveLearner(
+                c.platform.learn_s, c.platform.learn_window_s, 0.3 * c.platform.heave_sigma_m
+            )
         self._new_aligner()
+
+    @property
+    def heave_model(self) -> HeaveModel | None:
+        """The last heave model that was learned, or None."""
+        return self._learner.model if self._learner is not None else None
 
     @property
     def ready(self) -> bool:
@@ -260,7 +288,7 @@ class LandingEstimator:
     def _content_times(
         self, rows: NDArray[np.void], timesync_reference: str
     ) -> tuple[Int, NDArray[np.bool_]]:
-        """Return the time of each event's content on the inertial clock, map(stamp) - latency, and where it is known."""
+        """Return the time of each event's content on the inertial clock, map(stamp) - latency, and where known."""
         t: Int = rows["stamp_ns"].astype(np.int64)
         known = np.ones(len(rows), dtype=bool)
         home = self._names.clocks.index(AUTOPILOT)
@@ -295,8 +323,9 @@ class LandingEstimator:
                 i += 1
                 continue
             assert h.newest_ns is not None
-            t = r.t_ns[i : i + LOOK_AHEAD]
-            imu_here = is_imu[i : i + LOOK_AHEAD]
+            ahead = LOOK_AHEAD if self._learner is None else LOOK_AHEAD_LEARNING
+            t = r.t_ns[i : i + ahead]
+            imu_here = is_imu[i : i + ahead]
             imu_t = np.where(imu_here, t, np.iinfo(np.int64).min)
             newest = np.maximum.accumulate(np.concatenate(([h.newest_ns], imu_t)))[:-1]
             r.age_ns[i : i + len(t)] = newest - t
@@ -355,7 +384,25 @@ class LandingEstimator:
         h.advance(self._engine, out, self._period_ns)
         if out.count:
             self._estimates.append(out.filled())
-        self._settle(h.settle())
+        settled = h.settle()
+        self._settle(settled)
+        if self._learner is not None and len(settled):
+            self._learn(settled)
+
+    def _learn(self, settled: Rows) -> None:
+        """Learn the heave from fixes that are final; the filter takes the result up a fixed time later, so that
+        neither the order of arrival nor the size of a batch shows."""
+        assert self._learner is not None
+        for due_ns, model, parameters in self._learner.take(settled):
+            self._heave.append((due_ns, model))
+            if parameters is None:
+                continue
+            row = Rows.empty(1)
+            row.t_ns[0] = due_ns + self._history.window_ns + TAKE_UP_NS
+            row.kind[0] = HEAVE_MODEL
+            row.value[0], row.own[0, 0] = parameters[1:], parameters[0]
+            row.id[0] = -1
+            self._history.insert(row)
 
     def _feed_before_start(self, row: Rows) -> None:
         h = self._history
@@ -515,6 +562,10 @@ class LandingEstimator:
             sigma=e.sigma,
             state_names=self.layout.names,
             state_units=self.layout.units,
+            deck=e.deck,
+            deck_covariance=e.deck_covariance,
+            heave=list(self._heave),
+            clocks=self._clocks.summary(int(e.t_ns[-1]) if len(e.t_ns) else 0),
             records=records,
             sensors=tuple(self._names.sensors),
             notes=notes,
@@ -542,6 +593,10 @@ def _malformed(rows: Rows) -> Int:
     outcome = np.full(len(rows), PENDING, dtype=np.int64)
     needed = np.array([6, 0, 3, 2, 1, 3, 4, 1, 3, 1])[rows.kind]
     used = np.arange(6) < needed[:, None]
+    imu = rows.kind == Kind.IMU
+    with np.errstate(invalid="ignore"):
+        beyond = (np.abs(rows.value[:, :3]) > MAX_RATE_RADPS) | (np.abs(rows.value[:, 3:]) > MAX_FORCE_MPS2)
+    outcome[imu & beyond.any(axis=1)] = Outcome.REJECTED_GATE
     outcome[(used & ~np.isfinite(rows.value)).any(axis=1)] = Outcome.REJECTED_NOT_FINITE
     c = rows.own
     stated = ~np.isnan(c).all(axis=1) & np.isin(rows.kind, MEASURED_3D)

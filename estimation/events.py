@@ -11,6 +11,7 @@ Both forms hold the same numbers: an event is packed into one row of ``EVENT_DTY
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -359,7 +360,7 @@ def unpack(
     sensor, clock = sensors[int(row["sensor"])], clocks[int(row["clock"])]
     v = tuple(float(x) for x in row["value"])
     c = tuple(float(x) for x in row["covariance"])
-    own: Covariance3 | None = None if all(x != x for x in c) else (c[0], c[1], c[2], c[3], c[4], c[5])
+    own: Covariance3 | None = None if all(math.isnan(x) for x in c) else (c[0], c[1], c[2], c[3], c[4], c[5])
     xyz = (v[0], v[1], v[2])
     match kind:
         case Kind.IMU:
@@ -385,10 +386,10 @@ def unpack(
                 sent, stamp, sent + round_trip, arrival + delay, sensor, clock, timesync_reference
             )
         case Kind.USER:
-            size = sum(x == x for x in v)
-            own_user = tuple(x for x in c if x == x) or None
+            size = sum(not math.isnan(x) for x in v)
+            own_user = tuple(x for x in c if not math.isnan(x)) or None
             return UserMeasurement(stamp, arrival, v[:size], sensor, own_user, clock)
 
 
 def _fix_type(value: float) -> int:
-    return int(value) if value == value else 0
+    return 0 if math.isnan(value) else int(value)

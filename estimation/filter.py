@@ -107,7 +107,9 @@ class FilterPyEngine:
         for k in range(steps):
             middle = a + total * ((k + 0.5) / steps)
             mean = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, middle)
-            s.x = models.transition(s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q, s.heave)
+            s.x = models.transition(
+                s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q, s.heave
+            )
             self.ekf.P = s.P
             self.ekf.F = F
             self.ekf.Q = Q

@@ -141,9 +141,12 @@ class Rows:
 
 @dataclass(slots=True)
 class Estimates:
-    """Estimates as columns: time, nominal state (n, NOMINAL_SIZE), sigma of the error state (n, k), covariance (n, 9, 9)
-    of position, velocity and attitude error, and of the platform, where it is on, what ``deck_output`` gives (n, 8) with
-    its covariance (n, 8, 8). ``count`` rows are filled."""
+    """Estimates as columns, of which ``count`` rows are filled.
+
+    Time, nominal state (n, NOMINAL_SIZE), sigma of the error state (n, k), covariance (n, 9, 9) of position, velocity
+    and attitude error, and of the platform, where it is on, what ``deck_output`` gives (n, 8) with its covariance
+    (n, 8, 8).
+    """
 
     t_ns: Int
     x: Array
@@ -173,15 +176,17 @@ class Estimates:
 
     def filled(self) -> Estimates:
         """Return copies of the rows that are filled."""
-        return Estimates(*(c[: self.count].copy() for c in self.columns), self.count)
+        t, x, sigma, covariance, deck, deck_covariance = (c[: self.count].copy() for c in self.columns)
+        return Estimates(t, x, sigma, covariance, deck, deck_covariance, self.count)
 
     @staticmethod
     def concatenate(parts: list[Estimates], layout: Layout) -> Estimates:
         """Join filled estimates in their order."""
         if not parts:
             return Estimates.empty(0, layout)
-        columns = [np.concatenate(c) for c in zip(*(e.columns for e in parts), strict=True)]
-        return Estimates(*columns, len(columns[0]))
+        joined = (np.concatenate(c) for c in zip(*(e.columns for e in parts), strict=True))
+        t, x, sigma, covariance, deck, deck_covariance = joined
+        return Estimates(t, x, sigma, covariance, deck, deck_covariance, len(t))
 
 
 @dataclass(slots=True)

@@ -1,0 +1,138 @@
+"""The platform's models against finite differences and against what they mean."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from estimation import parameters as par
+from estimation.config import parse_config
+from estimation.deck import deck_output, deck_transition, heave_matrix, heave_stationary, seen_height, vision
+from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_to_matrix
+from estimation.parameters import Site, pack_parameters
+from estimation.state import CL0, CM0, P0, PH0, PL0, PO0, PS0, Q0, RS0, V0, Layout, nominal_zero, plus
+
+CONFIG = parse_config(
+    "[platform]\nuse = true\n[vision]\nlever_arm_m = [0.1, -0.05, 0.2]\nmount_rpy_rad = [0.02, -0.03, 0.1]\n"
+)
+LAYOUT = Layout.of(CONFIG)
+P = pack_parameters(CONFIG, Site((0.9, 0.1, 50.0), 0.0))
+HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4])
+GYRO = np.array([0.2, -0.3, 0.1])
+Array = NDArray[np.float64]
+
+
+def some_state(seed: int = 1) -> Array:
+    rng = np.random.default_rng(seed)
+    x = nominal_zero()
+    x[P0 : P0 + 3] = [3.0, -2.0, -12.0]
+    x[V0 : V0 + 3] = rng.normal(size=3)
+    x[Q0 : Q0 + 4] = euler_to_quat(0.2, -0.15, 1.1)
+    x[PO0 : PO0 + 2] = [4.0, -3.0]
+    x[PS0 : PS0 + 4] = rng.normal(size=4) * 0.1
+    x[PL0] = 0.3
+    x[PH0 : PH0 + 6] = rng.normal(size=6) * 0.3
+    x[RS0], x[CL0] = 0.01, 0.02
+    x[CM0 : CM0 + 3] = [0.01, -0.02, 0.015]
+    return x
+
+
+def innovation(x: Array, value: Array) -> tuple[Array, Array, Array]:
+    r, H, R = np.zeros(3), np.zeros((3, LAYOUT.size)), np.zeros((3, 3))
+    assert vision(value, np.full(6, math.nan), x, GYRO, P, LAYOUT.offsets, r, H, R) == 3
+    return r, H, R
+
+
+def test_the_fix_of_a_level_camera_over_the_deck_is_what_geometry_says() -> None:
+    config = parse_config("[platform]\nuse = true\n")
+    p = pack_parameters(config, Site((0.9, 0.1, 50.0), 0.0))
+    x = nominal_zero()
+    x[P0 : P0 + 3] = [0.0, 0.0, -10.0]
+    x[PO0 : PO0 + 2] = [1.0, 2.0]
+    x[PL0] = 0.5
+    r, H, R = np.zeros(3), np.zeros((3, LAYOUT.size)), np.zeros((3, 3))
+    # Camera axes: X right (east), Y backwards (south), Z down.
+    vision(np.array([2.0, -1.0, 9.5]), np.full(6, math.nan), x, np.zeros(3), p, LAYOUT.offsets, r, H, R)
+    assert r == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_the_jacobian_of_a_fix_is_its_derivative() -> None:
+    x, value, step = some_state(), np.array([1.0, 2.0, 11.0]), 1e-6
+    x[CL0] = 0.0
+    _, H, _ = innovation(x, value)
+    numeric = np.zeros_like(H)
+    for k in range(LAYOUT.size):
+        d = np.zeros(LAYOUT.size)
+        d[k] = step
+        forward, backward = (
+            innovation(plus(x, d, LAYOUT.offsets), value)[0],
+            innovation(plus(x, -d, LAYOUT.offsets), value)[0],
+        )
+        numeric[:, k] = -(forward - backward) / (2.0 * step)
+    # The mount's column is taken at the nominal mount: exact to first order in that mount.
+    mount = slice(LAYOUT.size - 3, LAYOUT.size)
+    assert H[:, mount] == pytest.approx(numeric[:, mount], abs=0.6)
+    rest = slice(0, LAYOUT.size - 3)
+    assert H[:, rest] == pytest.approx(numeric[:, rest], abs=1e-6)
+
+
+def test_the_transition_is_the_exponential_of_the_oscillators() -> None:
+    x, y, dt = some_state(), some_state(), 0.02
+    F, Q = np.eye(LAYOUT.size), np.zeros((LAYOUT.size, LAYOUT.size))
+    deck_transition(x, y, dt, P, HEAVE, LAYOUT.offsets, F, Q)
+    start = LAYOUT.names.index("platform_heave.1")
+    block = slice(start, start + 6)
+    f, drive = heave_matrix(HEAVE), np.zeros((6, 1))
+    drive[1] = HEAVE[0]
+    exact = expm(f * dt)
+    assert F[block, block] == pytest.approx(exact, abs=2e-7)
+    assert y[PH0 : PH0 + 6] == pytest.approx(exact @ x[PH0 : PH0 + 6], abs=1e-7)
+    big = np.block([[-f, drive @ drive.T], [np.zeros((6, 6)), f.T]])
+    turned = expm(big * dt)
+    noise = turned[6:, 6:].T @ turned[:6, 6:]
+    assert Q[block, block] == pytest.approx(noise, rel=1e-2, abs=1e-8)
+    assert np.linalg.eigvalsh(Q).min() > -1e-15
+
+
+def test_the_stationary_covariance_stays_as_it_is() -> None:
+    stationary, dt = heave_stationary(HEAVE), 0.02
+    F, Q = np.eye(LAYOUT.size), np.zeros((LAYOUT.size, LAYOUT.size))
+    x = some_state()
+    deck_transition(x, x.copy(), dt, P, HEAVE, LAYOUT.offsets, F, Q)
+    start = LAYOUT.names.index("platform_heave.1")
+    block = slice(start, start + 6)
+    sway = slice(LAYOUT.names.index("platform_sway.n"), LAYOUT.names.index("platform_sway.n") + 2)
+    after = F[block, block] @ stationary @ F[block, block].T + Q[block, block]
+    assert after == pytest.approx(stationary, abs=1e-4 * stationary.max())
+    s = np.diag([P[par.SWAY_SIGMA] ** 2, (P[par.SWAY_SIGMA] * P[par.SWAY_OMEGA]) ** 2])
+    assert F[sway, sway] @ s @ F[sway, sway].T + Q[sway, sway] == pytest.approx(s, abs=1e-5)
+
+
+def test_what_is_reported_is_the_difference_and_its_jacobian() -> None:
+    x, step = some_state(), 1e-6
+    y, A = deck_output(x, HEAVE, LAYOUT.offsets, LAYOUT.size)
+    height = x[PL0] + x[PH0 + 5]
+    assert y[6] == pytest.approx(height)
+    assert y[2] == pytest.approx(x[P0 + 2] + height)
+    assert y[7] == pytest.approx(heave_matrix(HEAVE)[5] @ x[PH0 : PH0 + 6])
+    for k in range(LAYOUT.size):
+        d = np.zeros(LAYOUT.size)
+        d[k] = step
+        change = deck_output(plus(x, d, LAYOUT.offsets), HEAVE, LAYOUT.offsets, LAYOUT.size)[0] - y
+        assert change / step == pytest.approx(A[:, k], abs=1e-6)
+
+
+def test_a_fix_that_is_too_short_shows_a_higher_deck() -> None:
+    x = nominal_zero()
+    x[P0 + 2] = -10.0
+    p = pack_parameters(parse_config("[platform]\nuse = true\n"), Site((0.9, 0.1, 50.0), 0.0))
+    height, variance = seen_height(np.array([0.0, 0.0, -0.2]), np.diag([0.1, 0.2, 0.3]), x, p)
+    assert height == pytest.approx(0.2)
+    assert variance == pytest.approx(0.3)
+    assert quat_to_matrix(x[Q0 : Q0 + 4]) @ R_CB_NOMINAL.T @ np.array([0, 0, 1.0]) == pytest.approx(
+        [0, 0, 1.0]
+    )
