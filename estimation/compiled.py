@@ -362,7 +362,8 @@ register_jitable(_fuse)
 def _advance(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, heave: Array, p: Array,
     offsets: Offsets, span: Int, ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array,
-    out_sigma: Array, out_covariance: Array, out_deck: Array, out_deck_covariance: Array, count: int, emit_after_ns: int, period_ns: int,
+    out_sigma: Array, out_covariance: Array, out_deck: Array, out_deck_covariance: Array, count: int,
+    emit_after_ns: int, period_ns: int,
 ) -> int:  # fmt: skip
     n = P.shape[0]
     F = np.empty((n, n))
