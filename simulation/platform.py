@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from simulation.jets import Array, Complex, Tones, constant, sinusoids
 from simulation.sea import GRAVITY_MPS2, Sea
 
 
-@dataclass(frozen=True, slots=True)
-class Raft:
+class Raft(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """A raft and its mooring.
 
     ``length_m``; natural period [s] and damping ratio of heave and of tilt; ``circle_m`` is r_plat, the

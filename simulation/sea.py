@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,8 +56,7 @@ def developed_period_s(hs_m: float) -> float:
     return float(2.0 * np.pi / 0.877 * np.sqrt(hs_m / (0.21 * GRAVITY_MPS2)))
 
 
-@dataclass(frozen=True, slots=True)
-class Wave:
+class Wave(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """One system of waves: ``kind`` is "jonswap", "pierson-moskowitz" or "swell" (JONSWAP with gamma 7).
 
     ``direction_rad`` is where the waves run to, from north towards east; ``spread_rad`` the 1-sigma about it.

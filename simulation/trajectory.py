@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,8 +20,7 @@ from simulation.platform import Platform
 PHASES = ("rest", "climb", "cruise", "hover", "descent", "deck")
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """A flight as durations and places. Lengths in m, NED from the anchor at the mean sea level; yaw in rad.
 
     ``start_m`` is the place of take-off (a quay), ``legs_m`` the places flown to one after the other at

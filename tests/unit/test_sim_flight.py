@@ -209,6 +209,8 @@ def test_all_scenarios_can_be_flown() -> None:
         ("description = 3", "description"),
         ("seed = 1", "description"),
         ("description = 'x'\ncolour = 'red'", "colour"),
+        ("description = 'x'\n[plan]\nhover = 3.0", "hover"),
+        ("description = 'x'\n[raft]\ncolour = 3.0", "colour"),
         ("description = 'x'\n[plan]\nhover_s = -1.0", "hover_s"),
         ("description = 'x'\n[sea]\nbeaufort = 7", "Beaufort 7"),
         ("description = 'x'\n[filter.imu]\nacel_noise = 1.0", "accel_noise"),
