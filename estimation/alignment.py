@@ -9,6 +9,7 @@ GPS and accelerometers both see. Nothing is given out before all of it is known.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,7 @@ from estimation.frames import (
     Array,
     euler_to_quat,
     geodetic_to_ned,
+    matrix_to_quat,
     normal_gravity,
     quat_exp,
     quat_multiply,
@@ -78,12 +80,6 @@ UNKNOWN_PLACE_M = 1000.0
 """1-sigma of the platform's place before it is seen, where no anchor is configured [m]."""
 UNKNOWN_LEVEL_M = 100.0
 """1-sigma of the platform's height before it is seen [m]."""
-FRESH_ATTITUDE_NS = 200_000_000
-"""Oldest attitude of another estimator that a start may use."""
-QUIET_RADPS = 0.2
-"""Fastest mean rotation in which a start in flight trusts the horizon [rad/s]."""
-QUIET_MPS2 = 0.8
-"""Largest horizontal acceleration in which it does [m/s^2]."""
 FRESH_NS = 1_200_000_000
 """Oldest GPS, magnetometer or attitude that a start may use."""
 
@@ -279,7 +275,7 @@ class Aligner:
         if attitude is None:
             return None
         q, yaw_sigma, how = attitude
-        return Aligned(site, self._state(t, q, yaw_sigma, rest, velocity, site), how)
+        return Aligned(site, self._state(t, q, yaw_sigma, rest, velocity, site, how), how)
 
     def _site(self) -> Site:
         assert self._fix is not None
@@ -301,33 +297,23 @@ class Aligner:
     ) -> tuple[Array, float, str] | None:
         c = self.config
         sigma = c.initialisation.yaw_sigma_rad
-        force = window[:, 3:].mean(axis=0)
-        gravity = normal_gravity(site.origin[0], site.origin[2])
-        stated = self._stated_attitude(t, window)
-        if not rest and stated is not None:
-            return stated, sigma, "in flight, from the autopilot's attitude"
-        acceleration = np.zeros(3) if rest else self._acceleration()
-        up = acceleration - np.array([0.0, 0.0, gravity])
+        attitude = self._attitude_now(t)
+        if not rest and attitude is not None:
+            return attitude, sigma, "in flight, from the autopilot's attitude"
+        gravity = np.array([0.0, 0.0, normal_gravity(site.origin[0], site.origin[2])])
+        force, up = window[:, 3:].mean(axis=0), -gravity
+        if not rest:
+            force, acceleration = self._force_and_acceleration()
+            up = acceleration - gravity
         where = "at rest" if rest else "in flight"
         if self._mag is not None:
-            if t - self._mag[0] > FRESH_NS:
+            turned = self._turned_since(self._mag[0])
+            if t - self._mag[0] > FRESH_NS or turned is None:
                 return None
-            # A tilt error turns the level field by its dip's tangent: only a quiet moment will do for a start.
-            turning = float(np.linalg.norm(window[:, :3].mean(axis=0))) > QUIET_RADPS
-            if not rest and (turning or float(np.linalg.norm(acceleration[:2])) > QUIET_MPS2):
-                return None
-            yaw = 0.0
-            q = _attitude_from(force, up, yaw)
-            for _ in range(12):
-                m = quat_to_matrix(q) @ self._mag[1]
-                yaw = wrap_pi(yaw + site.declination_rad - math.atan2(m[1], m[0]))
-                q = _attitude_from(force, up, yaw)
-            m = quat_to_matrix(q) @ self._mag[1]
-            dip = abs(m[2]) / max(1e-9, math.hypot(m[0], m[1]))
-            tilt = 0.0 if rest else c.initialisation.flight_tilt_sigma_rad
-            return q, min(0.5, math.hypot(sigma, dip * tilt)), f"{where}, heading from the magnetometer"
-        if stated is not None:
-            yaw = float(quat_to_euler(stated)[2])
+            q = _attitude_from_field(force, up, turned.T @ self._mag[1], site.declination_rad)
+            return None if q is None else (q, sigma, f"{where}, heading from the magnetometer")
+        if attitude is not None:
+            yaw = float(quat_to_euler(attitude)[2])
             return _attitude_from(force, up, yaw), sigma, f"{where}, heading from the autopilot's attitude"
         found = self._heading_from_motion()
         if found is None or found[1] > c.initialisation.motion_yaw_sigma_rad or self._level is None:
@@ -336,27 +322,61 @@ class Aligner:
         q = quat_normalise(quat_multiply(turn, self._level))
         return q, max(sigma, 1.5 * found[1]), "in flight, heading from horizontal acceleration"
 
-    def _stated_attitude(self, t: int, window: Array) -> Array | None:
-        """Return another estimator's attitude, turned on to ``t`` with the gyro, if it is fresh."""
-        if self._attitude is None or t - self._attitude[0] > FRESH_ATTITUDE_NS:
+    def _attitude_now(self, t: int) -> Array | None:
+        """Return the autopilot's last attitude, turned on to now with the gyro; None without a recent one."""
+        if self._attitude is None or t - self._attitude[0] > FRESH_NS:
             return None
-        span = (t - self._attitude[0]) * 1e-9
-        count = max(1, sum(s[0] > self._attitude[0] for s in self._imu))
-        turn = window[-count:, :3].mean(axis=0) * span
-        return quat_normalise(quat_multiply(self._attitude[1], quat_exp(turn)))
+        turned = self._turned_since(self._attitude[0])
+        return None if turned is None else matrix_to_quat(quat_to_matrix(self._attitude[1]) @ turned)
 
-    def _acceleration(self) -> Array:
-        """Return the mean NED acceleration over the window, from GPS velocities."""
+    def _turned_since(self, since_ns: int) -> Array | None:
+        """Return the rotation that takes body axes of now to those of then; None before the window's start."""
+        if since_ns < self._imu[0][0]:
+            return None
+        turned = np.eye(3)
+        for step, _, t0, dt in self._steps():
+            if t0 < since_ns - 0.5e9 * dt:
+                break
+            turned = step @ turned
+        return turned
+
+    def _steps(self) -> Iterator[tuple[Array, Array, int, float]]:
+        """Yield the window's steps, newest first: rotation over it (axes at its end to those at its begin), mean
+        specific force at its middle in axes at its end, its begin [ns] and length [s]."""
+        bias = self.gyro_bias if self.gyro_bias is not None else np.zeros(3)
+        for (t0, a), (t1, b) in zip(reversed(self._imu[:-1]), reversed(self._imu[1:]), strict=True):
+            dt = (t1 - t0) * 1e-9
+            rate = 0.5 * (a[:3] + b[:3]) - bias
+            half = quat_to_matrix(quat_exp(0.5 * dt * rate))
+            yield half @ half, half.T @ (0.5 * (a[3:] + b[3:])), t0, dt
+
+    def _impulse_between(self, t0: int, t1: int) -> Array:
+        """Return the specific force integrated from t0 to t1 [m/s] in the body's axes of now."""
+        total, back = np.zeros(3), np.eye(3)
+        for step, force, begin, dt in self._steps():
+            end = begin + dt * 1e9
+            share = max(0.0, min(end, t1) - max(begin, t0)) / max(1.0, end - begin)
+            total += share * dt * (back.T @ force)
+            back = step @ back
+        return total
+
+    def _force_and_acceleration(self) -> tuple[Array, Array]:
+        """Return the mean specific force, in the body's axes of now, and the mean NED acceleration of one interval.
+
+        The interval is that between two GPS velocities in the window; where there is none, the force's mean over the
+        window and no acceleration.
+        """
         t1, v1, _ = self._velocities[-1]
-        begin = t1 - int(1.5e9 * self.config.initialisation.rest_s)
-        t0, v0, _ = next(v for v in self._velocities if v[0] >= begin)
+        t0, v0, _ = next(v for v in self._velocities if v[0] >= self._imu[0][0] or v[0] == t1)
         if t1 - t0 < 0.3e9:
-            return np.zeros(3)
-        a = (v1 - v0) / ((t1 - t0) * 1e-9)
-        return np.where(np.isfinite(a), a, 0.0)
+            begin, end = self._imu[0][0], self._imu[-1][0]
+            return self._impulse_between(begin, end) / ((end - begin) * 1e-9), np.zeros(3)
+        span = (t1 - t0) * 1e-9
+        a = (v1 - v0) / span
+        return self._impulse_between(t0, t1) / span, np.where(np.isfinite(a), a, 0.0)
 
     def _state(
-        self, t: int, q: Array, yaw_sigma: float, rest: bool, velocity: Array, site: Site
+        self, t: int, q: Array, yaw_sigma: float, rest: bool, velocity: Array, site: Site, how: str
     ) -> FilterState:
         assert self._fix is not None
         c, o = self.config, self.layout.offsets
@@ -369,6 +389,13 @@ class Aligner:
         )
         x[V0 : V0 + 3] = 0.0 if rest else up_to_date
         x[Q0 : Q0 + 4] = q
+        R = quat_to_matrix(q)
+        x[P0 : P0 + 3] -= R @ np.array(c.gps.lever_arm_m)
+        if not rest and not self._velocity_derived:
+            # Carry the velocity on from its fix, where the window reaches back to it.
+            since = max(self._velocities[-1][0], self._imu[0][0])
+            gravity = np.array([0.0, 0.0, normal_gravity(site.origin[0], site.origin[2])])
+            x[V0 : V0 + 3] += R @ self._impulse_between(since, t) + gravity * ((t - since) * 1e-9)
         bias_known = rest or self.gyro_bias is not None
         if rest:
             x[BG0 : BG0 + 3] = window[:, :3].mean(axis=0)
@@ -388,10 +415,18 @@ class Aligner:
         speed = 4.0 * np.array([g.velocity_sigma_mps, g.velocity_sigma_mps, g.climb_sigma_mps]) ** 2
         put(VELOCITY, speed + DERIVED_SIGMA_MPS**2 if self._velocity_derived and not rest else speed)
         tilt = c.initialisation.tilt_sigma_rad if rest else c.initialisation.flight_tilt_sigma_rad
-        R = quat_to_matrix(q)
         a = int(o[ATTITUDE])
-        P[a : a + 3, a : a + 3] = R.T @ np.diag([tilt**2, tilt**2, yaw_sigma**2]) @ R
-        put(GYRO_BIAS, np.full(3, (0.1 if bias_known else 1.0) * c.imu.gyro_bias_sigma) ** 2)
+        errors = np.eye(3)
+        if self._mag is not None and "magnetometer" in how:
+            # A tilt error turns the field's steep part into a heading error: that of the yaw hangs on the tilt's.
+            field_n = R @ self._mag[1]
+            dip = field_n[2] / max(math.hypot(field_n[0], field_n[1]), 1e-12)
+            errors[2, :2] = dip * np.array([math.cos(site.declination_rad), math.sin(site.declination_rad)])
+        half = R.T @ errors @ np.diag([tilt, tilt, yaw_sigma])
+        P[a : a + 3, a : a + 3] = half @ half.T
+        averaged_s = (self._imu[-1][0] - self._imu[0][0]) * 1e-9
+        known = max((0.1 * c.imu.gyro_bias_sigma) ** 2, c.imu.gyro_noise**2 / averaged_s)
+        put(GYRO_BIAS, np.full(3, known if bias_known else c.imu.gyro_bias_sigma**2))
         put(ACCEL_BIAS, np.full(3, c.imu.accel_bias_sigma**2))
         if o[GPS_BIAS] >= 0:
             bias = np.array([g.bias_sigma_m, g.bias_sigma_m, g.height_bias_sigma_m]) ** 2
@@ -458,6 +493,34 @@ def _attitude_from(force: Array, up: Array, yaw: float) -> Array:
     z = f[1] * math.sin(roll) + f[2] * math.cos(roll)
     pitch = wrap_pi(math.atan2(u[0], u[2]) - math.atan2(f[0], z))
     return euler_to_quat(roll, pitch, yaw)
+
+
+def _attitude_from_field(force: Array, up: Array, magnetic: Array, declination_rad: float) -> Array | None:
+    """Return the body-to-NED quaternion that takes ``force`` to the direction ``up`` and points the horizontal part of
+    the field ``magnetic`` (body axes) along the declination; None where no turn about ``up`` does.
+
+    Of two such turns, the one that leaves more of the field horizontal.
+    """
+    u = up / np.linalg.norm(up)
+    level = quat_to_matrix(_attitude_from(force, up, 0.0))
+    m = level @ magnetic
+    along = (u @ m) * u
+    across, turned = m - along, np.cross(u, m)
+    aside = np.array([-math.sin(declination_rad), math.cos(declination_rad), 0.0])
+    ahead = np.array([math.cos(declination_rad), math.sin(declination_rad), 0.0])
+    # (along + across cos + turned sin) . aside = 0
+    a, b, c = float(across @ aside), float(turned @ aside), float(along @ aside)
+    size = math.hypot(a, b)
+    if size <= abs(c):
+        return None
+    middle, half = math.atan2(b, a), math.acos(-c / size)
+    best = max(
+        (middle + half, middle - half),
+        key=lambda x: float((across * math.cos(x) + turned * math.sin(x)) @ ahead),
+    )
+    if (along + across * math.cos(best) + turned * math.sin(best)) @ ahead <= 0.0:
+        return None
+    return quat_normalise(quat_multiply(quat_exp(best * u), matrix_to_quat(level)))
 
 
 def world_magnetic_declination(

@@ -222,7 +222,7 @@ def _fuse(
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     if w == 0.0:
-        if locked_out(memory, kind, t_s, r, m, p):
+        if locked_out(memory, kind, t_s, r, R, m, p):
             reset_datum(kind, x, P, r, R, m, offsets)
             memory[0] = 0.0
             return outcome, 1, x

@@ -152,7 +152,7 @@ class FilterPyEngine:
         w = update.weight(nis, m, self.p)
         if w == 0.0:
             rows.outcome[i] = Outcome.REJECTED_GATE
-            if update.locked_out(memory, kind, t_s, r, m, self.p):
+            if update.locked_out(memory, kind, t_s, r, R, m, self.p):
                 update.reset_datum(kind, s.x, s.P, r, R, m, self.layout.offsets)
                 memory[0] = 0.0
                 rows.reset[i] = 1

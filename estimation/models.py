@@ -296,10 +296,13 @@ def magnetometer(value: Array, x: Array, p: Array, offsets: Offsets, r: Array, H
         return UNUSABLE_NOW  # within 6 deg of the magnetic pole's vertical: no heading in it
     angle = p[par.DECLINATION] - math.atan2(m[1], m[0])
     r[0] = (angle + math.pi) % (2.0 * math.pi) - math.pi
-    D = compose(R_nb, skew(value[0:3]))
+    # At the predicted field, whose horizontal part lies along the declination, and not at the measured one: there the
+    # heading's noise would reach the tilt through the field's dip, always to the same side.
+    dip = m[2] / math.sqrt(horizontal)
+    north, east = -dip * math.cos(p[par.DECLINATION]), -dip * math.sin(p[par.DECLINATION])
     att = offsets[ATTITUDE]
     for j in range(3):
-        H[0, att + j] = (m[1] * D[0, j] - m[0] * D[1, j]) / horizontal
+        H[0, att + j] = north * R_nb[0, j] + east * R_nb[1, j] + R_nb[2, j]
     R[0, 0] = p[par.MAG_SIGMA] ** 2
     return 1
 

@@ -140,11 +140,12 @@ def hold_latency(x: Array, p: Array) -> None:
     x[CL0] = min(max(x[CL0], -p[par.LATENCY]), MAX_LATENCY_S - p[par.LATENCY])
 
 
-def locked_out(memory: Array, kind: int, t_s: float, r: Array, dimension: int, p: Array) -> bool:
+def locked_out(memory: Array, kind: int, t_s: float, r: Array, R: Array, dimension: int, p: Array) -> bool:
     """Note a rejection; return True when the sensor has contradicted the filter, but not itself, for too long.
 
     ``memory`` is the sensor's own. Only sensors that carry a datum (GPS, barometer, vision) can ever be right against
-    the filter; no number of rejections lets any other sensor in.
+    the filter; no number of rejections lets any other sensor in. Readings agree when they differ, beyond their own
+    noise ``R`` (4 sigma), by no more than the sensor's tolerance.
     """
     if kind == GPS_POSITION:
         tolerance = 5.0
@@ -153,9 +154,11 @@ def locked_out(memory: Array, kind: int, t_s: float, r: Array, dimension: int, p
     else:
         return False
     change = 0.0
+    noise = 0.0
     for i in range(dimension):
         change += (r[i] - memory[3 + i]) ** 2
-    if memory[0] == 0.0 or math.sqrt(change) > tolerance + 2.0 * (t_s - memory[2]):
+        noise += 2.0 * R[i, i]
+    if memory[0] == 0.0 or math.sqrt(change) > tolerance + 4.0 * math.sqrt(noise) + 2.0 * (t_s - memory[2]):
         memory[0] = 0.0
         memory[1] = t_s
     memory[0] += 1.0

@@ -13,10 +13,6 @@ from simulation.trajectory import PHASES
 SCENARIOS = ("consistency_default_2026_06", "consistency_survey_2026_06")
 QUICK, FULL = 8, 50
 
-BIASED = pytest.mark.xfail(
-    reason="heading noise reaches the tilt; the alignment leaves out the lever arm and the gyro's noise"
-)
-
 
 def table(result: dict[tuple[str, str], RunsConsistency]) -> str:
     return "\n".join(
@@ -32,7 +28,6 @@ def flights(request: pytest.FixtureRequest) -> list[FlightErrors]:
     return [fly(scenario, 1000 + seed) for seed in range(QUICK)]
 
 
-@BIASED
 def test_errors_are_what_the_covariance_says(flights: list[FlightErrors]) -> None:
     """The band of 99.9 % for so few flights: wide, and right for the many quantities and phases judged."""
     result = nees_by_phase(flights, 0.999)
@@ -48,7 +43,6 @@ def test_errors_are_what_the_covariance_says(flights: list[FlightErrors]) -> Non
     assert not table(result), table(result)
 
 
-@BIASED
 def test_innovations_are_what_the_filter_predicts(flights: list[FlightErrors]) -> None:
     result = nis_by_phase(flights, 0.999)
     assert {name for name, _ in result} >= {"gps_position", "gps_velocity", "barometer", "magnetometer"}
@@ -68,7 +62,6 @@ def test_innovations_are_white(flights: list[FlightErrors]) -> None:
         assert np.abs(np.mean(rho, axis=0)).max() < 4.0 / np.sqrt(n), name
 
 
-@BIASED
 @pytest.mark.nightly
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", SCENARIOS)

@@ -205,7 +205,6 @@ def test_rangefinder(x: Array, gyro: Array, distance: float) -> None:
     measured(models.RANGE, six(distance, 0.1, 60.0), gyro, x)
 
 
-@pytest.mark.xfail(reason="the Jacobian is taken at the measured field")
 def test_magnetometer_noise_does_not_reach_the_tilt() -> None:
     """The Jacobian must not follow the heading noise of the very field that it weighs: with a steep field
     that correlation would push the tilt, always to the same side.

@@ -13,6 +13,7 @@ from estimation.update import MEMORY_SIZE, locked_out, reading_noise, reset_datu
 
 P = pack_parameters(Config(), Site((0.9, 0.1, 50.0), 0.0))
 LAYOUT = Layout.of(Config())
+NOISE = np.diag([0.01, 0.01, 9.0])
 
 
 @pytest.mark.parametrize(("kind", "dimension"), [(GPS_POSITION, 3), (GPS_VELOCITY, 3), (BAROMETER, 1)])
@@ -62,12 +63,12 @@ def test_weight_falls_from_one_to_zero_at_the_bounds() -> None:
 
 def test_no_number_of_rejections_lets_a_sensor_without_a_datum_in() -> None:
     memory, r = np.zeros(MEMORY_SIZE), np.ones(3)
-    assert not any(locked_out(memory, 5, 0.1 * k, r, 1, P) for k in range(1000))
+    assert not any(locked_out(memory, 5, 0.1 * k, r, NOISE, 1, P) for k in range(1000))
 
 
 def test_a_gps_that_agrees_with_itself_is_believed_after_the_set_time() -> None:
     memory, r = np.zeros(MEMORY_SIZE), np.array([1000.0, 0.0, 0.0])
-    answers = [locked_out(memory, GPS_POSITION, 0.2 * k, r, 3, P) for k in range(40)]
+    answers = [locked_out(memory, GPS_POSITION, 0.2 * k, r, NOISE, 3, P) for k in range(40)]
     first = answers.index(True)
     assert 0.2 * first == pytest.approx(Config().gps.reset_after_s, abs=0.21)
 
@@ -75,7 +76,7 @@ def test_a_gps_that_agrees_with_itself_is_believed_after_the_set_time() -> None:
 def test_a_gps_that_contradicts_itself_is_never_believed() -> None:
     memory, rng = np.zeros(MEMORY_SIZE), np.random.default_rng(1)
     assert not any(
-        locked_out(memory, GPS_POSITION, 0.2 * k, rng.normal(size=3) * 500.0, 3, P) for k in range(500)
+        locked_out(memory, GPS_POSITION, 0.2 * k, rng.normal(size=3) * 500.0, NOISE, 3, P) for k in range(500)
     )
 
 
