@@ -13,6 +13,8 @@ from estimation.frames import R_CB_NOMINAL, skew
 from vision.area import fit_area
 from vision.camera import Camera, check_rotation
 from vision.ellipse import plane_rotations
+from vision.fix import NoFix, VisionFix
+from vision.judge import beyond_doubt, clearly_better, doubtful, judge_area, judge_profiles, rank
 from vision.lines import Edges
 from vision.plane import LevelPlane, rotation_to_level, rotation_vector_xy, rotation_xy
 from vision.redness import ratio_table, red_mask
@@ -23,10 +25,10 @@ from vision.rings import (
     find_contours,
     halve,
     identify_circles,
-    identify_votes,
 )
 from vision.target import RingTarget
 from vision.thesis import thesis_detect
+from vision.votes import identify_votes
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -43,54 +45,11 @@ MIN_DIAMETER_PX = 8.5
 """Outer diameter below which nothing can be told from a red spot."""
 SMALL_PX = 80.0
 """Outer diameter below which all pixels of the target are fitted where its edges could not be."""
-FEW_PIXELS = 250
-MIN_GAIN_OVER_DISC = 8.0
-"""How many times worse a plain disc has to fit than the target."""
-MIN_GAIN_OVER_SMALL_DISC = 2.5
-"""The same where so few pixels show the target that its rings are hardly resolved."""
-MIN_RED_SLOPE = -0.35
-"""Least change of R per change of (G + B) / 2 from red to white; on blue water it is about -1."""
 BLUR_ERROR = 0.04
 """Error of an edge's place that all edges share, per pixel of blur beyond that of a sharp picture."""
 MAX_FITS = 16
 MAX_AREA_FITS = 6
 """Limits of the work spent on one image."""
-
-
-@dataclass(frozen=True, slots=True)
-class VisionFix:
-    """Where the target's centre is, in the camera frame.
-
-    ``position_cam_m`` (3,) is P^c of seed (4.27); ``covariance_m2`` (3, 3). ``rings`` are the indices of
-    the edges that were measured (into ``RingTarget.edges_m``), ``residual_px`` the scatter of their
-    displacements from the model, ``tilt_rad`` (2,) the rotation of the deck about the level x and y axes
-    where it was estimated, else None. ``share`` of the visible edge length that agrees with the model,
-    ``blur_px`` the blur's 1-sigma. ``rotation`` takes the camera to the plane of the target (``R_nc`` for a
-    level deck). ``points_px`` (n, 2) are the places that were compared and ``agrees`` (n,) the outcome.
-    """
-
-    position_cam_m: Array
-    covariance_m2: Array
-    rings: tuple[int, ...]
-    residual_px: float
-    share: float
-    blur_px: float
-    method: str
-    rotation: Array
-    tilt_rad: Array | None = None
-    points_px: Array | None = None
-    agrees: NDArray[np.bool_] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class NoFix:
-    """No target, and why. False in a condition."""
-
-    reason: str
-
-    def __bool__(self) -> bool:
-        """Return False, so that ``if fix:`` reads well."""
-        return False
 
 
 class TargetDetector:
@@ -260,7 +219,7 @@ class TargetDetector:
                         reason = "rings, but with more red rings around them"
                         continue
                     accepted.append(fit)
-                    if rotation is not None and _beyond_doubt(fit):
+                    if rotation is not None and beyond_doubt(fit):
                         break
                 if accepted:
                     return self._fix(accepted, rotation, "found")
@@ -345,12 +304,12 @@ class TargetDetector:
             )
 
         fit = fit_with(sigma or (AUTO_TILT_SIGMA_RAD if candidate.tilt.any() else 0.0))
-        if sigma == 0.0 and not candidate.tilt.any() and _doubtful(fit):
+        if sigma == 0.0 and not candidate.tilt.any() and doubtful(fit):
             # Does the image contradict a level deck?
             tilted = fit_with(AUTO_TILT_SIGMA_RAD)
-            if tilted is not None and (fit is None or _clearly_better(tilted, fit)):
+            if tilted is not None and (fit is None or clearly_better(tilted, fit)):
                 fit = tilted
-        judged = _judge_profiles(fit, self.min_share)
+        judged = judge_profiles(fit, self.min_share)
         if isinstance(judged, str) and 2.0 * self._edges[0] * to_px < SMALL_PX:
             small = self._fit_small(image, candidate, sigma, left)
             return judged if isinstance(small, str) else small
@@ -396,7 +355,7 @@ class TargetDetector:
                 tilt_sigma_rad=tilt_sigma_rad,
                 sectors=sectors,
             )
-            judged = _judge_area(fit, sectors > 1, self.min_share, max_blur_px)
+            judged = judge_area(fit, sectors > 1, self.min_share, max_blur_px)
             if isinstance(judged, str):
                 reason = reason or judged
             elif 2.0 * self._edges[0] * judged.kappa / unit < MIN_DIAMETER_PX:
@@ -408,7 +367,7 @@ class TargetDetector:
         return reason if best is None else best
 
     def _fix(self, fits: list[Fit], rotation: Array | None, how: str) -> VisionFix:
-        best = max(fits, key=_rank)
+        best = max(fits, key=rank)
         position, covariance = self._position(best, rotation is not None)
         if rotation is None:
             # Two planes see the same ellipse; where they fit equally well, either may be the right one.
@@ -469,70 +428,6 @@ class _Candidate:
     hypothesis: Hypothesis
     plane: LevelPlane
     tilt: Array
-
-
-def _beyond_doubt(fit: Fit) -> bool:
-    return fit.share > 0.8 and len(fit.edges) >= 3 and (not fit.is_area or fit.chi2 > 25.0)
-
-
-def _rank(fit: Fit) -> tuple[float, float]:
-    if fit.is_area:
-        return 0.5, fit.chi2
-    return float(round(5.0 * fit.share)), -fit.residual_px
-
-
-def _doubtful(fit: Fit | None) -> bool:
-    return fit is None or fit.share < 0.8 or fit.residual_px > 0.1 or fit.chi2 > 3.0
-
-
-def _clearly_better(tilted: Fit, level: Fit) -> bool:
-    """Return whether freeing the tilt explains the image much better (likelihood ratio over all lines)."""
-    if tilted.share > level.share + 0.1:
-        return True
-    ratio = level.count * 2.0 * np.log(max(level.residual_px, 1e-6) / max(tilted.residual_px, 1e-6))
-    return tilted.share > level.share - 0.02 and bool(ratio > 25.0)
-
-
-def _judge_profiles(fit: Fit | None, min_share: float) -> Fit | str:
-    if fit is None:
-        return "rings of the target's ratios, but too few of their edges fit"
-    if fit.share < min_share:
-        return f"only {fit.share:.0%} of the visible edges fit the target"
-    if len(fit.edges) < 2 or fit.count < 16:
-        return f"only {len(fit.edges)} edge(s) of the target fit"
-    if fit.red_slope < MIN_RED_SLOPE:
-        return "red rings, but not on white"
-    if fit.contradicted > 0.2:
-        return f"where {fit.contradicted:.0%} of the edges should be is plain white or red"
-    if fit.residual_px > 0.12 * max(1.0, fit.blur_px) or abs(fit.growth_px) > 0.6 * max(1.0, fit.blur_px):
-        return f"edges are {max(fit.residual_px, abs(fit.growth_px)):.1f} px off the target's"
-    if not fit.covariance[2, 2] < (0.05 * fit.kappa) ** 2:
-        return "the scale is not observable"
-    return fit
-
-
-def _judge_area(fit: Fit | None, covered: bool, min_share: float, max_blur_px: float) -> Fit | str:
-    """Judge a fit of all pixels; the limits lie between what targets and what look-alikes were seen to give.
-
-    They are closer where part of the target may be ``covered``, because more can then be explained away.
-    """
-    if fit is None:
-        return "a small red region that is no target"
-    few = fit.count < FEW_PIXELS
-    limit = (0.08 if few else 0.055) if covered else (0.085 if few else 0.07)
-    if fit.share < (min_share if covered else 0.85) or fit.residual_px > limit:
-        return f"a small red region that differs from the target by {fit.residual_px:.0%} of its contrast"
-    if fit.red_slope < MIN_RED_SLOPE:
-        return "a small red region, but not on white"
-    if fit.contradicted > 0.0:
-        return "a small red region whose rings have other radii"
-    if not (0.38 if covered else 0.28) < fit.blur_px < min(1.8, max_blur_px) or abs(fit.growth_px) > 0.45:
-        return "a small red region whose edges are not as sharp as the target's"
-    if fit.chi2 < (MIN_GAIN_OVER_SMALL_DISC if few else MIN_GAIN_OVER_DISC):
-        return "a small red disc without visible rings"
-    if not fit.covariance[2, 2] < (0.1 * fit.kappa) ** 2:
-        return "the scale is not observable"
-    return fit
 
 
 def _sigma(name: str, value: float, limit: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.camera import Camera
-from vision.detector import NoFix, VisionFix
+from vision.fix import NoFix, VisionFix
 from vision.redness import red_mask
 from vision.target import RingTarget
 
