@@ -202,7 +202,7 @@ def _measurements(result: Result, plots: Plots) -> str:
         '<p class="lead">An innovation is a measurement less its prediction. Its normalised square, the NIS, '
         "averages to one per degree of freedom when noise and latency are right, and lies in the green band "
         "95 % of the time.</p>",
-        table(("sensor", "innovations", "NIS / dof", "inside 95 % band"), rows, numeric=(1, 2, 3)),
+        table(("sensor", "innovations", "NIS / dof", "up to the 95 % bound"), rows, numeric=(1, 2, 3)),
     ]
     for name in shown[:MOST_SENSORS]:
         figure = sensor_figures.innovations(result, name)

@@ -144,6 +144,14 @@ class GpsConfig(_Table, frozen=True):
     max_accuracy_m: Annotated[
         float, _positive("a fix that states a worse horizontal accuracy is not used", "m")
     ] = 50.0
+    rtk_accuracy_m: Annotated[
+        float,
+        _not_negative(
+            "an RTK fix that states a better accuracy than this is taken at its word (not below 0.3, in height 0.5 of "
+            "this) and carries no wander; 0: never",
+            "m",
+        ),
+    ] = 0.1
     reset_after_s: Annotated[
         float,
         _positive(

@@ -226,7 +226,7 @@ def gps_variance(own: float, floor: float, white_fraction: float) -> float:
 def gps_position(
     value: Array, own: Array, x: Array, p: Array, offsets: Offsets, r: Array, H: Array, R: Array
 ) -> int:
-    """Antenna position in NED: P + R_nb l + GPS bias."""
+    """Antenna position in NED: P + R_nb l + GPS bias; an RTK fix that says it is exact has no bias."""
     if not value[3] >= 1.0:
         return UNUSABLE_NOW
     limit = p[par.GPS_MAX_ACCURACY] ** 2
@@ -236,7 +236,9 @@ def gps_position(
     R_nb = quat_to_matrix(x[Q0 : Q0 + 4])
     z = geodetic_to_ned(value[0], value[1], value[2], p[par.ORIGIN : par.ORIGIN + 3])
     arm = rotate(R_nb, lever)
-    biased = offsets[GPS_BIAS] >= 0
+    exact = p[par.GPS_RTK_ACCURACY]
+    precise = value[3] >= 2.0 and own[0] <= exact * exact and own[3] <= exact * exact
+    biased = offsets[GPS_BIAS] >= 0 and not precise
     fraction = p[par.GPS_WHITE_FRACTION] if biased else 1.0
     for i in range(3):
         r[i] = z[i] - x[P0 + i] - arm[i]
@@ -245,9 +247,11 @@ def gps_position(
             r[i] -= x[BP0 + i]
             H[i, offsets[GPS_BIAS] + i] = 1.0
     put(H, 0, offsets[ATTITUDE], -1.0, compose(R_nb, skew(lever)))
-    R[0, 0] = gps_variance(own[0], p[par.GPS_SIGMA_H], fraction)
-    R[1, 1] = gps_variance(own[3], p[par.GPS_SIGMA_H], fraction)
-    R[2, 2] = gps_variance(own[5], p[par.GPS_SIGMA_V], fraction)
+    across = 0.3 * exact if precise else p[par.GPS_SIGMA_H]
+    up = 0.5 * exact if precise else p[par.GPS_SIGMA_V]
+    R[0, 0] = gps_variance(own[0], across, fraction)
+    R[1, 1] = gps_variance(own[3], across, fraction)
+    R[2, 2] = gps_variance(own[5], up, fraction)
     return 3
 
 

@@ -36,6 +36,7 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     GPS_BIAS_TIME,
     GPS_BIAS_TIME_V,
     GPS_MAX_ACCURACY,
+    GPS_RTK_ACCURACY,
     GPS_RESET_AFTER,
     BARO_USE,
     BARO_SIGMA,
@@ -83,7 +84,7 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     SWAY_ZETA,
     LEVEL_WALK,
     SIZE,
-) = range(69)
+) = range(70)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +114,7 @@ def pack_parameters(config: Config, site: Site) -> Array:
     p[GPS_WHITE_FRACTION] = c.gps.white_fraction
     p[GPS_BIAS_H], p[GPS_BIAS_V] = c.gps.bias_sigma_m, c.gps.height_bias_sigma_m
     p[GPS_BIAS_TIME], p[GPS_MAX_ACCURACY] = c.gps.bias_time_s, c.gps.max_accuracy_m
+    p[GPS_RTK_ACCURACY] = c.gps.rtk_accuracy_m
     p[GPS_BIAS_TIME_V] = c.gps.height_bias_time_s
     p[GPS_RESET_AFTER] = c.gps.reset_after_s
     p[BARO_USE], p[BARO_SIGMA], p[BARO_BIAS_WALK] = (
