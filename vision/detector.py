@@ -41,7 +41,7 @@ THESIS_RELATIVE_SIGMA = 0.07
 """1-sigma per axis of a fix by the thesis's method, as a share of the distance (its reported errors: 6-8
 %)."""
 MAX_DECK_TILT_RAD = 0.27
-MIN_DIAMETER_PX = 8.5
+MIN_DIAMETER_PX = 7.0
 """Outer diameter below which nothing can be told from a red spot."""
 SMALL_PX = 80.0
 """Outer diameter below which all pixels of the target are fitted where its edges could not be."""
