@@ -13,6 +13,7 @@ from importlib import metadata, util
 from pathlib import Path
 
 from deckfix._version import __version__
+from estimation.codecache import cache_home, writable
 
 PACKAGES = ("estimation", "vision", "logs", "simulation", "deckfix")
 """The top-level packages of this distribution."""
@@ -124,22 +125,18 @@ def _origin(name: str) -> Path | None:
 
 def _places() -> Iterable[Check]:
     for name, folder in (("this folder", Path.cwd()), ("temporary files", Path(tempfile.gettempdir()))):
-        writable = _writable(folder)
-        yield Check(
-            name, f"{folder} {'is' if writable else 'is not'} writable", "" if writable else "choose another"
-        )
+        good = _writable(folder)
+        yield Check(name, f"{folder} {'is' if good else 'is not'} writable", "" if good else "choose another")
     if _version("numba"):
-        cache = os.environ.get("NUMBA_CACHE_DIR")
-        package = Path(__file__).resolve().parent.parent / "estimation"
-        if cache:
-            good = _writable(Path(cache))
-            yield Check(
-                "compiled code", f"is kept in {cache}", "" if good else "make NUMBA_CACHE_DIR writable"
-            )
-        elif _writable(package):
-            yield Check("compiled code", f"is kept in {package / '__pycache__'}")
+        cache = cache_home()
+        if writable(cache):
+            yield Check("compiled code", f"is kept in {cache}")
         else:
-            yield Check("compiled code", "is kept in the user's cache folder, since the package is read-only")
+            yield Check(
+                "compiled code",
+                f"cannot be kept in {cache}",
+                "set XDG_CACHE_HOME to a folder that can be written",
+            )
 
 
 def _writable(folder: Path) -> bool:

@@ -86,7 +86,8 @@ def copy_source(flight: Flight, writer: FlightWriter) -> None:
 
 
 def estimate_series(run: Run, utc_offset_ns: int) -> list[Series]:
-    """Return the topics of a run: odometry, the whole state, and one series of fusion records a sensor.
+    """Return the topics of a run: odometry, the whole state, the platform where it is on, and one series of fusion
+    records a sensor.
 
     Fusion records are stamped with the time of their content and logged at their arrival; ``utc_offset_ns``
     takes the inertial clock to UTC.
@@ -99,6 +100,7 @@ def estimate_series(run: Run, utc_offset_ns: int) -> list[Series]:
         pose = (run.position_m, run.velocity_mps, run.quaternion, run.covariance)
         out.append(odometry_series("/estimate/odometry", run.t_ns, arrival, *pose))
         out.append(state_series(run.state_names, run.t_ns, arrival, state_values(run), run.sigma))
+        out.extend(_deck_series(run, arrival))
     for index in np.unique(run.records["sensor"]):
         r = run.records[run.records["sensor"] == index]
         told = (r["outcome"].astype(np.uint8), r["nis"], r["dof"].astype(np.uint8))
@@ -106,6 +108,29 @@ def estimate_series(run: Run, utc_offset_ns: int) -> list[Series]:
         rest = (r["innovation"], r["sigma"], r["age_s"])
         out.append(fusion_series(name, r["t_ns"], r["arrival_ns"], *told, *rest))
     return out
+
+
+def _deck_series(run: Run, arrival: NDArray[np.int64]) -> list[Series]:
+    """Return the vehicle relative to the platform, and the platform, where its states were on."""
+    from logs.estimates import odometry_series
+
+    if not run.deck.shape[1]:
+        return []
+    n, covariance, deck = len(run.t_ns), run.covariance.copy(), run.deck_covariance
+    covariance[:, :6, :6] = deck[:, :6, :6]
+    relative = (run.deck[:, :3], run.deck[:, 3:6], run.quaternion, covariance)
+    place, speed = run.position_m - run.deck[:, :3], run.velocity_mps - run.deck[:, 3:6]
+    level = np.zeros((n, 4))
+    level[:, 0] = 1.0
+    own = np.zeros((n, 9, 9))
+    own[:, 2, 2], own[:, 5, 5] = deck[:, 6, 6], deck[:, 7, 7]
+    for axis, name in enumerate(("n", "e")):
+        k = run.state_names.index(f"platform_offset.{name}")
+        own[:, axis, axis] = run.sigma[:, k] ** 2
+    return [
+        odometry_series("/estimate/relative", run.t_ns, arrival, *relative),
+        odometry_series("/estimate/platform", run.t_ns, arrival, place, speed, level, own),
+    ]
 
 
 def state_values(run: Run) -> NDArray[np.float64]:

@@ -4,9 +4,10 @@ holds.
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from deckfix.streams import streams, vibration_mps2
 from estimation.config import Config, dump_config, load_config, parse_config
 from estimation.estimator import EngineName, Facts, LandingEstimator, Run
 from estimation.events import AUTOPILOT, EventBatch, Kind
+from estimation.state import CAMERA_LATENCY, NOMINAL
 
 if TYPE_CHECKING:
     from logs.reader import Flight
@@ -129,6 +131,7 @@ def present(
         metadata={name: dict(entries) for name, entries in flight.metadata.items()},
         vibration_mps2=vibration_mps2(batch),
         source=flight,
+        clocks=clock_blocks(run, config),
     )
     if truth is not None and len(run.t_ns) > 1:
         own = (run.t_ns, run.position_m, run.velocity_mps, run.quaternion)
@@ -136,6 +139,33 @@ def present(
         if autopilot is not None:
             result.at_autopilot = at_reference(run, autopilot, truth, result.judged)
     return result
+
+
+def clock_blocks(run: Run, config: Config) -> dict[str, dict[str, Any]]:
+    """Return what was found of every clock but the inertial one.
+
+    ``offset_ms`` is that clock less the inertial one. ``latency_ms`` is the age of a vision fix at its stamp (positive:
+    the content is older than the stamp), given where the platform's states were on, for the clock of the fixes.
+    """
+    out: dict[str, dict[str, Any]] = {}
+    for c in run.clocks:
+        values: dict[str, Any] = {
+            "offset_ms": c.offset_ns * 1e-6,
+            "skew_ppm": c.skew_ppm,
+            "sigma_ms": c.sigma_ns * 1e-6,
+            "status": str(c.status),
+            "source": c.source,
+        }
+        out[c.clock] = {k: v for k, v in values.items() if not isinstance(v, float) or math.isfinite(v)}
+    if run.deck.shape[1] and len(run.t_ns):
+        k = run.state_names.index("camera_latency.t")
+        age = config.vision.latency_s + float(run.nominal[-1, NOMINAL[CAMERA_LATENCY]])
+        sigma = float(run.sigma[-1, k])
+        learned = sigma < 0.5 * config.vision.latency_sigma_s
+        for values in out.values():
+            values["latency_ms"], values["latency_sigma_ms"] = age * 1e3, sigma * 1e3
+            values["latency_status"] = "estimated" if learned else "unobservable"
+    return out
 
 
 def at_reference(run: Run, autopilot: Trajectory, truth: Trajectory, judged: Window) -> AtReference | None:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
     from estimation.estimator import Run
+    from estimation.heave.model import HeaveModel
     from logs.reader import Flight
 
 Array = NDArray[np.float64]
@@ -200,6 +201,8 @@ class Result:
                 out["ratio"]["contact_s"] = self.seconds(self.judged.contact_ns)
         if self.clocks:
             out["clock"] = self.clocks
+        if self.run.heave:
+            out["heave"] = heave_block(self.run.heave[-1][1])
         return out
 
     def to_pandas(self) -> pd.DataFrame:
@@ -247,6 +250,20 @@ class Result:
         from deckfix.estimate_log import write
 
         write(self, path, force=force, inputs=inputs)
+
+
+def heave_block(model: HeaveModel) -> dict[str, Any]:
+    """Return a heave model in the terms of the summary: components are (A [m], T [s], phi [rad]) of seed (3.6), largest
+    first, with t = 0 at the model's last fix.
+    """
+    largest = sorted(model.components, key=lambda c: -c[0])[:8]
+    return {
+        "hs_m": float(model.hs_m),
+        "tp_s": float(model.tp_s),
+        "dominant_period_s": float(model.dominant_period_s),
+        "components": [[float(v) for v in c] for c in largest],
+        "skill": {f"{h:g}": float(model.skill(h)) for h in (0.5, 1.0, 2.0, 3.0, 5.0)},
+    }
 
 
 def nis_bound(dof: Array) -> Array:

@@ -6,10 +6,8 @@ code under the user's cache folder, keyed by the sources, so that an edit is nev
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import math
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +20,7 @@ from numba.extending import overload, register_jitable
 
 from estimation import deck, frames, models, parameters, state, update
 from estimation import rows as rows_module
+from estimation.codecache import cache_of
 from estimation.deck import deck_output, seen_height
 from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
@@ -64,16 +63,11 @@ _IMU = 0
 
 
 @contextmanager
-def _cache_of_these_sources() -> Iterator[None]:
-    """Let numba cache what is defined within, in a folder named after the sources that it is compiled from."""
-    digest = hashlib.sha256()
-    for module in (deck, frames, models, parameters, rows_module, state, update):
-        digest.update(Path(inspect.getfile(module)).read_bytes())
-    digest.update(Path(__file__).read_bytes())
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+def _cached_in(folder: Path) -> Iterator[None]:
+    """Let numba cache what is defined within in a folder; it reads its setting when a function is decorated."""
     settings: Any = numba.config
     before = settings.CACHE_DIR
-    settings.CACHE_DIR = str(base / "deckfix" / digest.hexdigest()[:16])
+    settings.CACHE_DIR = str(folder)
     try:
         yield
     finally:
@@ -413,8 +407,14 @@ def _advance(
 
 
 def _jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    with _cache_of_these_sources():
-        compiled: Callable[..., Any] = numba.njit(cache=True, error_model="numpy")(function)
+    modules = (deck, frames, models, parameters, rows_module, state, update)
+    folder = cache_of([Path(inspect.getfile(m)) for m in modules] + [Path(__file__)])
+    compiled: Callable[..., Any]
+    if folder is None:
+        compiled = numba.njit(error_model="numpy")(function)
+        return compiled
+    with _cached_in(folder):
+        compiled = numba.njit(cache=True, error_model="numpy")(function)
     return compiled
 
 

@@ -1,11 +1,10 @@
 """Estimates, truth and reports of fusion <-> the columns of their topics.
 
-``nav_msgs/Odometry`` says: the pose is in ``header.frame_id``, the twist in ``child_frame_id``, and
-rotational covariance is about the fixed axes of the former. The estimator says: velocity in NED, attitude
-error as a rotation vector in the body frame. These functions turn the one into the other and back:
+``nav_msgs/Odometry`` has the rotational covariance about the fixed axes of ``header.frame_id``; the estimator has
+the attitude error as a rotation vector in the body frame. These functions turn the one into the other and back:
 
-- twist.linear is ``R_bn v_n``, body axes (FRD); its covariance is that of the NED velocity turned into body
-  axes, the attitude's own uncertainty left out, so that it can be turned back;
+- twist.linear is the velocity in NED axes, as in every odometry topic of this project, and the channel's metadata say
+  so (``twist_frame`` = ``ned``); a series without that is read as the message defines it, in the body's axes;
 - rotational pose covariance is ``R_nb P_b R_nb^T``;
 - correlations of velocity with position and attitude have no place in the message and come back as zero;
 - no covariance at all (truth, another estimator's attitude) is written as zeros.
@@ -70,7 +69,7 @@ def odometry_series(
     rotation = _matrices(quaternion_wxyz)
     data["pose_pose_position"] = position_m
     data["pose_pose_orientation"] = quaternion_wxyz[:, [1, 2, 3, 0]]
-    data["twist_twist_linear"] = np.einsum("nji,nj->ni", rotation, velocity_mps)
+    data["twist_twist_linear"] = velocity_mps
     if angular_velocity_radps is not None:
         data["twist_twist_angular"] = angular_velocity_radps
     if covariance is not None:
@@ -79,7 +78,7 @@ def odometry_series(
         pose[:, :, 3:] = pose[:, :, 3:] @ rotation.transpose(0, 2, 1)
         data["pose_covariance"] = pose.reshape(-1, 36)
         twist = np.zeros((len(stamp_ns), 6, 6))
-        twist[:, :3, :3] = rotation.transpose(0, 2, 1) @ covariance[:, 3:6, 3:6] @ rotation
+        twist[:, :3, :3] = covariance[:, 3:6, 3:6]
         data["twist_covariance"] = twist.reshape(-1, 36)
     known = TOPICS[topic]
     return Series(
@@ -90,7 +89,7 @@ def odometry_series(
         clock,
         known.frame_id,
         dict(known.strings),
-        dict(metadata or {}),
+        {"twist_frame": "ned", **(metadata or {})},
     )
 
 
@@ -106,12 +105,16 @@ def odometry_columns(series: Series) -> OdometryColumns:
     covariance = np.zeros((len(data), 9, 9))
     covariance[:, _POSE[:, None], _POSE] = pose
     twist = data["twist_covariance"].reshape(-1, 6, 6)[:, :3, :3]
-    covariance[:, 3:6, 3:6] = rotation @ twist @ back
+    velocity = data["twist_twist_linear"].copy()
+    if series.metadata.get("twist_frame") != "ned":
+        velocity = np.einsum("nij,nj->ni", rotation, velocity)
+        twist = rotation @ twist @ back
+    covariance[:, 3:6, 3:6] = twist
     return OdometryColumns(
         series.stamp_ns,
         series.arrival_ns,
         data["pose_pose_position"].copy(),
-        np.einsum("nij,nj->ni", rotation, data["twist_twist_linear"]),
+        velocity,
         quaternion,
         data["twist_twist_angular"].copy(),
         covariance,

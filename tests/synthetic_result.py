@@ -67,6 +67,7 @@ def synthetic_run(seed: int = 1, seconds: float = 76.0, rate_hz: float = 50.0) -
         "deck": np.zeros((n, 0)),
         "deck_covariance": np.zeros((n, 0, 0)),
         "heave": [],
+        "clocks": [],
     }
     run = Run(**{f.name: values[f.name] for f in fields(Run)})
     return run, truth

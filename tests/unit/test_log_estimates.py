@@ -45,7 +45,7 @@ def test_odometry_comes_back() -> None:
     np.testing.assert_allclose(back.covariance, expected, atol=1e-12)
 
 
-def test_twist_is_in_the_body_and_rotation_about_fixed_axes() -> None:
+def test_twist_and_rotation_are_about_fixed_axes() -> None:
     yaw = euler_to_quat(0.0, 0.0, np.pi / 2)
     covariance = np.diag([0, 0, 0, 1, 2, 3, 4, 5, 6]).astype(float)[None]
     series = odometry_series(
@@ -57,12 +57,15 @@ def test_twist_is_in_the_body_and_rotation_about_fixed_axes() -> None:
         yaw[None],
         covariance,
     )
-    # Heading east and moving east is moving forwards.
-    np.testing.assert_allclose(series.data["twist_twist_linear"][0], [2, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(series.data["twist_twist_linear"][0], [0, 2, 0], atol=1e-12)
+    assert series.metadata["twist_frame"] == "ned"
+    # The same message without that mark is in the body's axes: heading east, its second axis points south.
+    series.metadata.clear()
+    np.testing.assert_allclose(odometry_columns(series).velocity_mps[0], [-2, 0, 0], atol=1e-12)
     pose = series.data["pose_covariance"][0].reshape(6, 6)
     np.testing.assert_allclose(np.diag(pose), [0, 0, 0, 5, 4, 6], atol=1e-12)
     twist = series.data["twist_covariance"][0].reshape(6, 6)
-    np.testing.assert_allclose(np.diag(twist), [2, 1, 3, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(np.diag(twist), [1, 2, 3, 0, 0, 0], atol=1e-12)
     assert series.data["pose_pose_orientation"][0].tolist() == yaw[[1, 2, 3, 0]].tolist()
 
 

@@ -1,6 +1,6 @@
 """The detector against ArUco and AprilTag on one renderer: accuracy, consistency, robustness, time.
 
-    python benchmarks/vision.py [--full] [--frames N] [--only accuracy,nees,robust,false,time] [--json FILE]
+    python benchmarks/rings.py [--full] [--frames N] [--only accuracy,nees,robust,false,time] [--json FILE]
 
 Camera 640x480, 62.2 deg. Targets and markers 1.0 m (a marker's black border), on a white board; camera
 calibrated, attitude known. Roll and pitch uniform in +-25 deg, any yaw, anywhere in the frame; at 1 m
@@ -16,7 +16,6 @@ import argparse
 import json
 import math
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -25,8 +24,6 @@ from typing import Any
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
-# This file's name is also a package's, which is meant below: the folder of the script is searched last.
-sys.path.append(sys.path.pop(0))
 
 import cv2
 import numpy as np
