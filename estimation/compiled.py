@@ -101,12 +101,24 @@ def _rotate(m: Array, v: Array) -> Callable[[Array, Array], Array]:
     return product
 
 
+@overload(models.put)
+def _put(target: Array, row: int, column: int, scale: float, block: Array) -> Callable[..., None]:
+    """Compile the small assignment as loops, without a product in between."""
+
+    def assign(target: Array, row: int, column: int, scale: float, block: Array) -> None:
+        for i in range(3):
+            for j in range(3):
+                target[row + i, column + j] = scale * block[i, j]
+
+    return assign
+
+
 for _module in (deck, frames, models, state, update):
     for _function in vars(_module).values():
         if (
             inspect.isfunction(_function)
             and _function.__module__ == _module.__name__
-            and _function not in (frames.compose, frames.rotate, deck.heave_stationary)
+            and _function not in (frames.compose, frames.rotate, models.put, deck.heave_stationary)
         ):
             register_jitable(_function)
 

@@ -16,7 +16,7 @@ import numpy as np
 from estimation.rows import Estimates, FilterState, Int, Rows
 
 IMU = 0
-CHECKPOINT_NS = 50_000_000
+CHECKPOINT_NS = 70_000_000
 """Spacing of the checkpoints: what a rewind runs again beyond the event's own age, at most."""
 
 

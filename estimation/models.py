@@ -62,11 +62,11 @@ def right_jacobian(v: Array) -> Array:
         angle = math.sqrt(angle2)
         a = (1.0 - math.cos(angle)) / angle2
         b = (angle - math.sin(angle)) / (angle2 * angle)
-    J: Array = skew(v) * -a
+    J = skew(v)
     # [v]x squared is v v' - |v|^2 I.
     for i in range(3):
         for j in range(3):
-            J[i, j] += b * v[i] * v[j]
+            J[i, j] = b * v[i] * v[j] - a * J[i, j]
         J[i, i] += 1.0 - b * angle2
     return J
 
