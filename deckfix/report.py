@@ -197,12 +197,25 @@ def _measurements(result: Result, plots: Plots) -> str:
         assert s is not None
         doubtful = s.count >= 30 and not 0.2 <= s.mean_over_dof <= 2.0
         mean = f'<span class="off">{s.mean_over_dof:.2f}</span>' if doubtful else f"{s.mean_over_dof:.2f}"
-        rows.append(("", [_name(name), f"{s.count:,}", mean, f"{100 * s.inside_95:.0f} %"]))
+        rows.append(
+            (
+                "",
+                [
+                    _name(name),
+                    f"{s.count:,}",
+                    mean,
+                    f"{100 * s.inside_95:.0f} %",
+                    f"{100 * s.above_95:.1f} %",
+                ],
+            )
+        )
     out = [
         '<p class="lead">An innovation is a measurement less its prediction. Its normalised square, the NIS, '
         "averages to one per degree of freedom when noise and latency are right, and lies in the green band "
         "95 % of the time.</p>",
-        table(("sensor", "innovations", "NIS / dof", "up to the 95 % bound"), rows, numeric=(1, 2, 3)),
+        table(
+            ("sensor", "innovations", "NIS / dof", "inside 95 % band", "above it"), rows, numeric=(1, 2, 3, 4)
+        ),
     ]
     for name in shown[:MOST_SENSORS]:
         figure = sensor_figures.innovations(result, name)

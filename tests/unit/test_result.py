@@ -41,7 +41,7 @@ def test_the_summary_has_the_documented_keys(result: Result) -> None:
     ]  # fmt: skip
     assert summary["duration_s"] == pytest.approx(15.99)
     assert summary["events"]["imu"] == {"count": 1600, "rate_hz": pytest.approx(100.0), "gaps": 0}
-    assert set(summary["nis"]["barometer"]) == {"mean_over_dof", "inside_95"}
+    assert set(summary["nis"]["barometer"]) == {"mean_over_dof", "inside_95", "above_95"}
     fused = summary["fusion"]["gps_position"]
     assert sum(fused.values()) == 80
     errors = summary["truth"]["odometry"]
