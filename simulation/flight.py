@@ -22,7 +22,7 @@ import numpy as np
 from estimation.alignment import world_magnetic_declination
 from estimation.config import Config, ConfigError, dump_config, parse_config
 from estimation.estimator import Facts
-from estimation.events import AUTOPILOT, COMPANION, EventBatch
+from estimation.events import AUTOPILOT, EventBatch
 from estimation.frames import normal_gravity
 from logs.events import series_of_batch
 from logs.recording import Recording, Series
@@ -30,7 +30,7 @@ from logs.sensors import Times, odometry_series
 from simulation.jets import Array
 from simulation.platform import Platform, Raft
 from simulation.sea import BEAUFORT_WIND_MPS, Sea, Wave, beaufort
-from simulation.sensors import Clock, Place, Sensors, SlowError, Streams
+from simulation.sensors import CLOCKS, Clock, Place, Sensors, SlowError, Streams
 from simulation.trajectory import Plan, Trajectory, Wind, quaternions
 
 TRUTH_RATE_HZ = 50.0
@@ -117,7 +117,7 @@ class SimulatedFlight:
 
     def recording(self) -> Recording:
         """Return the flight as a recording: sensors, truth, the filter's configuration and how it was made."""
-        offsets = {name: self._offset_ns(name) for name in (AUTOPILOT, COMPANION)}
+        offsets = {name: self._offset_ns(name) for name in CLOCKS}
         series = series_of_batch(self.batch)
         used = {s.clock for s in series}
         for one in series:

@@ -10,7 +10,8 @@ factor of 1 + gain; - an inertial sample is the instantaneous value at the time 
 estimator takes it, and not a mean over the interval before; - bias walks, the GPS position's Gauss-Markov
 error and the barometer's offset are drawn exactly, for any interval; - the receiver states the whole of its
 position error (white and slow) as its accuracy; - the magnetometer's error is one of heading: the field is
-turned about the vertical; - the time of the content is that of the stamp less the latency.
+turned about the vertical; - the time of the content is that of the stamp less the latency; - vision fixes are
+those of ``simulation.fixes``.
 
 A filter that is told something else than what was drawn sees a mismatch; scenarios name it (``[mismatch]``).
 """
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from estimation.config import Config
 from estimation.events import AUTOPILOT, CAMERA, COMPANION, EVENT_DTYPE, EventBatch, Kind
 from estimation.frames import ned_to_geodetic, quat_exp, quat_multiply
+from simulation.fixes import CameraErrors, View, draw_fixes
 from simulation.jets import Array
 from simulation.trajectory import Motion, Trajectory
 
@@ -55,8 +57,21 @@ class Stream(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=Tr
     clock: str = AUTOPILOT
 
 
+class VisionStream(Stream, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """How vision fixes come: late, and stamped by the companion. ``covariance`` says whether they state theirs."""
+
+    rate_hz: _Positive = 30.0
+    first_s: _NotNegative = 0.005
+    delay_s: _NotNegative = 0.06
+    clock: str = COMPANION
+    view: View = View()
+    covariance: bool = True
+
+
 class Streams(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """The messages of all sensors. ``timesync`` are exchanges of the companion with the autopilot."""
+    """The messages of all sensors. ``timesync`` are exchanges of the companion with the autopilot; there is no
+    ``vision`` unless it is asked for.
+    """
 
     imu: Stream = Stream(rate_hz=200.0)
     gps: Stream = Stream(rate_hz=5.0, first_s=0.03)
@@ -65,6 +80,7 @@ class Streams(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=T
     attitude: Stream = Stream(rate_hz=10.0, first_s=0.023)
     rangefinder: Stream = Stream(rate_hz=20.0, first_s=0.007)
     timesync: Stream | None = None
+    vision: VisionStream | None = None
 
 
 class Clock(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
@@ -136,7 +152,7 @@ class Sensors:
 
         Each sensor draws from a generator of its own, so that switching one on or off changes no other.
         """
-        generators = iter(rng.spawn(7))
+        generators = iter(rng.spawn(8))
         c, s = self.config, self.streams
         slow: dict[str, SlowError] = {}
         parts = [
@@ -149,8 +165,11 @@ class Sensors:
         ]
         used = [True, True, c.barometer.use, c.magnetometer.use, c.attitude.use != "off", c.rangefinder.use]
         batches = [p for p, on in zip(parts, used, strict=True) if on]
+        exchanging, seeing = generators
         if s.timesync is not None:
-            batches.append(self._timesync(trajectory, s.timesync, next(generators)))
+            batches.append(self._timesync(trajectory, s.timesync, exchanging))
+        if s.vision is not None:
+            batches.append(self._vision(trajectory, s.vision, seeing, slow))
         return Drawn(EventBatch.concatenate(batches), slow)
 
     def _imu(
@@ -208,7 +227,8 @@ class Sensors:
         for name, kind, value, variance in both:
             again = np.random.default_rng(seed)
             values = np.hstack([value, fix])
-            batches.append(self._batch(name, kind, t, values, variance, c.latency_s, stream, again))
+            stated = np.array([variance[0], 0.0, 0.0, variance[1], 0.0, variance[2]])
+            batches.append(self._batch(name, kind, t, values, stated, c.latency_s, stream, again))
         return EventBatch.concatenate(batches)
 
     def _barometer(
@@ -256,6 +276,27 @@ class Sensors:
         value = np.stack([distance, np.zeros(len(t)), np.full(len(t), 100.0)], axis=1)
         return self._batch("rangefinder", Kind.RANGEFINDER, t, value, None, c.latency_s, stream, rng)
 
+    def _vision(
+        self,
+        trajectory: Trajectory,
+        stream: VisionStream,
+        rng: np.random.Generator,
+        slow: dict[str, SlowError],
+    ) -> EventBatch:
+        c = self.config.vision
+        t = _times(stream, trajectory.plan.duration_s)
+        errors = CameraErrors.draw(c, t, rng)
+        found = draw_fixes(c, stream.view, trajectory, t, errors, rng)
+        constant = np.ones((len(t), 1))
+        slow["range_scale"] = SlowError(t, errors.scale * constant)
+        slow["camera_latency"] = SlowError(t, errors.latency_s[:, None])
+        slow["camera_mount"] = SlowError(t, errors.mount_rad * constant)
+        stated = found.covariance_m2 if stream.covariance else None
+        age = c.latency_s + errors.latency_s
+        return self._batch(
+            "vision", Kind.VISION, t, found.position_cam_m, stated, age, stream, rng, found.seen
+        )
+
     def _timesync(self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator) -> EventBatch:
         """Exchanges that the companion asks for: each way takes the stream's delay."""
         t = _times(stream, trajectory.plan.duration_s)
@@ -273,10 +314,12 @@ class Sensors:
         return EventBatch(rows[rng.random(len(t)) >= stream.drop], ("timesync",), CLOCKS)
 
     def _batch(
-        self, name: str, kind: Kind, t: Array, value: Array, variance: Array | None, latency_s: float,
-        stream: Stream, rng: np.random.Generator,
+        self, name: str, kind: Kind, t: Array, value: Array, stated: Array | None, latency_s: float | Array,
+        stream: Stream, rng: np.random.Generator, there: NDArray[np.bool_] | None = None,
     ) -> EventBatch:  # fmt: skip
-        """Return messages whose content is of the times t [s]; ``variance`` (3,) is what the source states."""
+        """Return messages whose content is of the times t [s]. ``stated`` is the upper triangle of the covariance that
+        the source gives, (6,) or (n, 6); ``there`` (n,) says which messages there are (None: all).
+        """
         n = len(t)
         rows = np.zeros(n, dtype=EVENT_DTYPE)
         jitter = stream.jitter_s * rng.standard_normal(n)
@@ -288,9 +331,11 @@ class Sensors:
         rows["clock"] = CLOCKS.index(stream.clock)
         rows["value"], rows["covariance"] = np.nan, np.nan
         rows["value"][:, : value.shape[1]] = value
-        if variance is not None:
-            rows["covariance"] = [variance[0], 0.0, 0.0, variance[1], 0.0, variance[2]]
+        if stated is not None:
+            rows["covariance"] = stated
         kept = rng.random(n) >= stream.drop
+        if there is not None:
+            kept &= there
         return EventBatch(rows[kept], (name,), CLOCKS)
 
 
