@@ -12,9 +12,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.ahead import DeckForecast, DeckForecaster
 from estimation.alignment import Aligner
 from estimation.clockbank import ClockBank, ClockSummary
 from estimation.config import Config, ConfigError
+from estimation.deck import HEAVE_SIZE
 from estimation.events import (
     AUTOPILOT,
     COMPANION,
@@ -35,7 +37,7 @@ from estimation.learning import HeaveLearner
 from estimation.outcome import Outcome
 from estimation.parameters import Site, pack_parameters
 from estimation.rows import HEAVE_MODEL, PENDING, Estimates, FilterState, Int, Rows
-from estimation.state import BA0, BG0, P0, Q0, V0, Layout
+from estimation.state import BA0, BG0, P0, PH0, PLATFORM_HEAVE, Q0, V0, Layout
 
 EngineName = Literal["auto", "filterpy", "compiled"]
 
@@ -93,7 +95,8 @@ class Estimate:
 
     ``position_m`` and ``velocity_mps`` are NED from the origin, ``quaternion`` takes body to NED, ``covariance``
     (9, 9) is of position, velocity and attitude error (rotation vector in the body frame). ``sigma`` has the
-    1-sigma of every entry of the error state, ``nominal`` the whole state (``estimation.state``).
+    1-sigma of every entry of the error state, ``nominal`` the whole state (``estimation.state``). ``deck`` (8,) and
+    ``deck_covariance`` (8, 8) are what ``estimation.deck.deck_output`` gives, empty where the platform is off.
     """
 
     t_ns: int
@@ -103,6 +106,8 @@ class Estimate:
     covariance: Array
     nominal: Array
     sigma: Array
+    deck: Array
+    deck_covariance: Array
 
 
 @dataclass(slots=True)
@@ -235,22 +240,40 @@ class LandingEstimator:
 
     def step(self, event: Event) -> Output:
         """Take one event, in the order of arrival."""
-        row = np.array([pack(event, self._names)], dtype=EVENT_DTYPE)
-        self._take(row)
-        out = self._collect()
-        last = out[0].count - 1
-        return Output(_estimate(out[0], last) if last >= 0 else None, out[1], out[2])
+        self._take(np.array([pack(event, self._names)], dtype=EVENT_DTYPE))
+        return self._output()
+
+    def feed(self, batch: EventBatch) -> Output:
+        """Take the events of a batch, in its order, as ``step`` would one by one; the last estimate is given out."""
+        self._take(self._named(batch), batch.timesync_reference)
+        return self._output()
 
     def run(self, batch: EventBatch) -> Run:
         """Take a batch, in its order, to its end, and return all that it led to."""
-        rows = batch.rows.copy()
-        sensors = np.array([self._names.sensor(s) for s in batch.sensors] or [0], dtype=np.int16)
-        clocks = np.array([self._names.clock(c) for c in batch.clocks] or [0], dtype=np.int16)
-        rows["sensor"] = sensors[batch.rows["sensor"]]
-        rows["clock"] = clocks[batch.rows["clock"]]
-        self._take(rows, batch.timesync_reference)
+        self._take(self._named(batch), batch.timesync_reference)
         self.finish()
         return self._as_run(*self._collect())
+
+    def last_fused_ns(self, kind: Kind) -> int | None:
+        """Return the time of the newest content of this kind that is in the estimate, or None.
+
+        Only what is still in the window counts: older than ``filter.window_s`` is None.
+        """
+        h = self._history
+        kinds, outcome = h.rows.kind[: h.done], h.rows.outcome[: h.done]
+        found = np.flatnonzero((kinds == kind) & (outcome >= 0) & (outcome <= Outcome.DOWNWEIGHTED))
+        return int(h.rows.t_ns[found[-1]]) if len(found) else None
+
+    def deck_forecast(self, forecaster: DeckForecaster) -> DeckForecast | None:
+        """Return the deck ahead of the newest estimate, or None before the start and where the platform is off."""
+        start = int(self.layout.offsets[PLATFORM_HEAVE])
+        if self._engine is None or start < 0:
+            return None
+        s = self._engine.state
+        block = slice(start, start + HEAVE_SIZE)
+        learned = self._learner is not None and self._learner.block is not None
+        x = s.x[PH0 : PH0 + HEAVE_SIZE]
+        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], s.heave, learned)
 
     def finish(self) -> None:
         """Settle what is still in the window; measurements that no inertial sample followed were in the future."""
@@ -266,6 +289,15 @@ class LandingEstimator:
         h.drop(h.size)
 
     # -- intake ------------------------------------------------------------------------------------------------
+
+    def _named(self, batch: EventBatch) -> NDArray[np.void]:
+        """Return a batch's rows with the indices of this estimator's names."""
+        rows = batch.rows.copy()
+        sensors = np.array([self._names.sensor(s) for s in batch.sensors] or [0], dtype=np.int16)
+        clocks = np.array([self._names.clock(c) for c in batch.clocks] or [0], dtype=np.int16)
+        rows["sensor"] = sensors[batch.rows["sensor"]]
+        rows["clock"] = clocks[batch.rows["clock"]]
+        return rows
 
     def _take(self, rows: NDArray[np.void], timesync_reference: str = COMPANION) -> None:
         ids = self._next_id + np.arange(len(rows))
@@ -538,6 +570,11 @@ class LandingEstimator:
             self._notes.append((int(r.t_ns[i]), text))
         return records
 
+    def _output(self) -> Output:
+        estimates, records, notes = self._collect()
+        last = estimates.count - 1
+        return Output(_estimate(estimates, last) if last >= 0 else None, records, notes)
+
     def _collect(self) -> tuple[Estimates, NDArray[np.void], list[tuple[int, str]]]:
         estimates = Estimates.concatenate(self._estimates, self.layout)
         records = self._final_records()
@@ -615,5 +652,13 @@ def _malformed(rows: Rows) -> Int:
 def _estimate(e: Estimates, i: int) -> Estimate:
     x = e.x[i]
     return Estimate(
-        int(e.t_ns[i]), x[P0 : P0 + 3], x[V0 : V0 + 3], x[Q0 : Q0 + 4], e.covariance[i], x, e.sigma[i]
+        int(e.t_ns[i]),
+        x[P0 : P0 + 3],
+        x[V0 : V0 + 3],
+        x[Q0 : Q0 + 4],
+        e.covariance[i],
+        x,
+        e.sigma[i],
+        e.deck[i],
+        e.deck_covariance[i],
     )

@@ -1,0 +1,115 @@
+"""The deck a few seconds ahead of the estimate, from the filter's own heave states.
+
+The heave block is linear, x' = f x + l w, so that what is known of it at a time h later is exact:
+x(h) = F x, covariance F P F' + S - F S F' with F = exp(f h) and S the block's covariance in a sea without end. With
+growing h the forecast goes over into what is known of the sea alone; it is never worse than that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from estimation.deck import HEAVE_SIZE, heave_matrix, heave_stationary
+from estimation.frames import Array
+
+
+@dataclass(frozen=True, slots=True)
+class DeckForecast:
+    """The deck's height about its level and its rate, up, at the times ``horizon_s`` (m,) after ``t_ns``.
+
+    ``height_m``, ``height_sigma_m``, ``rate_mps``, ``rate_sigma_mps`` (m,); ``skill`` (m,) is 1 - variance of the
+    rate over that of the sea: 1 is certain, 0 knows nothing but the sea. ``sea_rate_sigma_mps`` is the rate's 1-sigma
+    in that sea, ``learned`` tells whether the sea was learned in flight (else it is the configuration's prior).
+    """
+
+    t_ns: int
+    horizon_s: Array
+    height_m: Array
+    height_sigma_m: Array
+    rate_mps: Array
+    rate_sigma_mps: Array
+    skill: Array
+    sea_rate_sigma_mps: float
+    learned: bool
+
+    def rate_at(self, horizon_s: float) -> tuple[float, float]:
+        """Return the rate and its 1-sigma [m/s] at a horizon, interpolated, and held beyond the ends."""
+        rate = float(np.interp(horizon_s, self.horizon_s, self.rate_mps))
+        return rate, float(np.interp(horizon_s, self.horizon_s, self.rate_sigma_mps))
+
+    def quiet_probability(self, begin_s: float, end_s: float, rate_limit_mps: float) -> float:
+        """Return the smallest probability, over the horizons from begin to end, that |rate| is below the limit.
+
+        It bounds from above the probability that the deck is quiet throughout, and is close to it for a window that is
+        short against the waves' period. 0 where no horizon lies in the window.
+        """
+        inside = (self.horizon_s >= begin_s) & (self.horizon_s <= end_s)
+        quiet = [
+            _between(-rate_limit_mps, rate_limit_mps, float(m), float(s))
+            for m, s in zip(self.rate_mps[inside], self.rate_sigma_mps[inside], strict=True)
+        ]
+        return min(quiet, default=0.0)
+
+
+@dataclass(slots=True)
+class DeckForecaster:
+    """Forecasts at fixed horizons; keeps the transitions of the last heave parameters, which change rarely."""
+
+    horizon_s: Array
+    _parameters: Array | None = None
+    _rows: Array | None = None
+    _spread: Array | None = None
+    _sea: Array | None = None
+
+    @classmethod
+    def at(cls, horizon_s: ArrayLike) -> DeckForecaster:
+        """Return a forecaster for these horizons (m,) [s], ascending from 0 or later.
+
+        Raises ``ValueError`` for horizons that are not.
+        """
+        h = np.asarray(horizon_s, dtype=np.float64)
+        if h.ndim != 1 or not len(h) or not np.all(np.isfinite(h)) or h[0] < 0.0 or np.any(np.diff(h) <= 0.0):
+            raise ValueError("horizon_s: must be a list of ascending seconds, from 0 or later")
+        return cls(h)
+
+    def forecast(self, t_ns: int, heave: Array, P: Array, parameters: Array, learned: bool) -> DeckForecast:
+        """Return the forecast from the heave states (6,), their covariance (6, 6) and parameters (7,) at ``t_ns``."""
+        if self._parameters is None or not np.array_equal(parameters, self._parameters):
+            self._prepare(parameters)
+        assert self._rows is not None and self._spread is not None and self._sea is not None
+        mean = self._rows @ heave
+        variance = np.einsum("mki,ij,mkj->mk", self._rows, P, self._rows) + self._spread
+        # What is known of the sea alone bounds the doubt.
+        variance = np.clip(variance, 0.0, self._sea)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            skill = np.where(self._sea[1] > 0.0, 1.0 - variance[:, 1] / self._sea[1], 0.0)
+        sigma = np.sqrt(variance)
+        return DeckForecast(
+            t_ns, self.horizon_s, mean[:, 0], sigma[:, 0], mean[:, 1], sigma[:, 1], skill,
+            math.sqrt(self._sea[1]), learned,
+        )  # fmt: skip
+
+    def _prepare(self, parameters: Array) -> None:
+        """Fill rows (m, 2, 6) of height and rate, their own spread (m, 2) and the sea's variances (2,)."""
+        from scipy.linalg import expm
+
+        f, S = heave_matrix(parameters), heave_stationary(parameters)
+        seen = np.zeros((2, HEAVE_SIZE))
+        seen[0, 5] = 1.0
+        seen[1] = f[5]
+        self._rows = np.stack([seen @ expm(f * h) for h in self.horizon_s])
+        self._sea = np.einsum("ki,ij,kj->k", seen, S, seen)
+        self._spread = self._sea - np.einsum("mki,ij,mkj->mk", self._rows, S, self._rows)
+        self._parameters = parameters.copy()
+
+
+def _between(low: float, high: float, mean: float, sigma: float) -> float:
+    """Return the probability that a Gaussian lies between two limits."""
+    if sigma <= 0.0:
+        return float(low < mean < high)
+    scale = 1.0 / (sigma * math.sqrt(2.0))
+    return 0.5 * (math.erf((high - mean) * scale) - math.erf((low - mean) * scale))

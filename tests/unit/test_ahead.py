@@ -1,0 +1,94 @@
+"""The deck's forecast against the filter's own propagation, and against the sea."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from estimation.ahead import DeckForecaster
+from estimation.config import parse_config
+from estimation.deck import deck_transition, heave_matrix, heave_stationary
+from estimation.estimator import LandingEstimator
+from estimation.parameters import Site, pack_parameters
+from estimation.state import PH0, Layout, nominal_zero
+from simulation.flight import load_scenario, simulate
+
+HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4])
+
+
+def some_heave() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(6, 6)) * 0.02
+    return rng.normal(size=6) * 0.3, root @ root.T + 1e-4 * np.eye(6)
+
+
+def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
+    layout = Layout.of(parse_config("[platform]\nuse = true\n"))
+    p = pack_parameters(parse_config("[platform]\nuse = true\n"), Site((0.9, 0.1, 0.0), 0.0))
+    start = layout.names.index("platform_heave.1")
+    block = slice(start, start + 6)
+    x6, P = some_heave()
+    x, covariance = nominal_zero(), P.copy()
+    x[PH0 : PH0 + 6] = x6
+    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x6, P, HEAVE, True)
+    for _ in range(160):
+        F, Q = np.eye(layout.size), np.zeros((layout.size, layout.size))
+        y = x.copy()
+        deck_transition(x, y, 0.005, p, HEAVE, layout.offsets, F, Q)
+        x = y
+        covariance = F[block, block] @ covariance @ F[block, block].T + Q[block, block]
+    rate = heave_matrix(HEAVE)[5]
+    assert forecast.height_m == pytest.approx([x6[5], x[PH0 + 5]], abs=1e-6)
+    assert forecast.rate_mps == pytest.approx([rate @ x6, rate @ x[PH0 : PH0 + 6]], abs=1e-6)
+    assert forecast.rate_sigma_mps[1] == pytest.approx(math.sqrt(rate @ covariance @ rate), rel=1e-3)
+    assert forecast.height_sigma_m[1] == pytest.approx(math.sqrt(covariance[5, 5]), rel=1e-3)
+
+
+def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
+    x6, P = some_heave()
+    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x6, 1e3 * P, HEAVE, False)
+    sea = heave_stationary(HEAVE)
+    rate = heave_matrix(HEAVE)[5]
+    assert forecast.sea_rate_sigma_mps == pytest.approx(math.sqrt(rate @ sea @ rate))
+    assert np.all(forecast.rate_sigma_mps <= forecast.sea_rate_sigma_mps * (1.0 + 1e-12))
+    assert np.all((forecast.skill >= 0.0) & (forecast.skill <= 1.0))
+    assert forecast.rate_mps[2] == pytest.approx(0.0, abs=1e-6)
+    assert forecast.height_sigma_m[2] == pytest.approx(math.sqrt(sea[5, 5]), rel=1e-6)
+
+
+def test_the_probability_of_quiet_is_that_of_the_worst_moment() -> None:
+    x6, P = some_heave()
+    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x6, P, HEAVE, True)
+    chance = forecast.quiet_probability(0.5, 1.5, 0.3)
+    rng = np.random.default_rng(1)
+    inside = (forecast.horizon_s >= 0.5) & (forecast.horizon_s <= 1.5)
+    drawn = forecast.rate_mps + forecast.rate_sigma_mps * rng.standard_normal((200_000, 30))
+    shares = (np.abs(drawn) < 0.3).mean(axis=0)[inside]
+    assert chance == pytest.approx(shares.min(), abs=0.005)
+    assert forecast.quiet_probability(0.5, 1.5, 0.5) >= chance
+    assert forecast.quiet_probability(5.0, 6.0, 0.3) == 0.0
+
+
+def test_horizons_that_are_none_are_refused() -> None:
+    for wrong in ([], [1.0, 0.5], [-1.0, 1.0], [math.nan]):
+        with pytest.raises(ValueError, match="horizon_s"):
+            DeckForecaster.at(wrong)
+
+
+def test_events_fed_in_pieces_lead_to_the_estimates_of_single_steps() -> None:
+    flight = simulate(load_scenario("consistency_default_2026_06"), 3)
+    batch = flight.batch
+    whole, pieces = (LandingEstimator(flight.scenario.config, engine="filterpy") for _ in range(2))
+    rows = batch.rows[:900]
+    stepped = [whole.step(e) for e in list(type(batch)(rows, batch.sensors, batch.clocks))]
+    fed = [
+        pieces.feed(type(batch)(rows[k : k + 7], batch.sensors, batch.clocks)) for k in range(0, len(rows), 7)
+    ]
+    known = {o.estimate.t_ns: o.estimate for o in stepped if o.estimate is not None}
+    given = [o.estimate for o in fed if o.estimate is not None]
+    assert len(given) > 30
+    for estimate in given:
+        assert np.array_equal(estimate.nominal, known[estimate.t_ns].nominal)
+    assert sum(len(o.records) for o in stepped) == sum(len(o.records) for o in fed)
