@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from logs.reader import Flight
     from logs.recording import Series
 
-COMPARED = ("/estimate/odometry", "/estimate/state", "/fusion")
+COMPARED = (
+    "/estimate/odometry", "/estimate/relative", "/estimate/platform", "/estimate/state", "/fusion",
+    "/heave/model", "/heave/forecast",
+)  # fmt: skip
 
 
 def check_replay(
@@ -70,19 +73,19 @@ def compare_recorded(result: Result, flight: Flight) -> tuple[list[str], int] | 
     if not recorded:
         return None
     ours: dict[str, list[Series]] = {t: [] for t in COMPARED}
-    for series in estimate_series(result.run, flight.clock_offsets_ns.get(AUTOPILOT, 0)):
+    for series in estimate_series(result.run, flight.clock_offsets_ns.get(AUTOPILOT, 0), result.forecasts):
         ours[series.topic].append(series)
     differing = [t for t, theirs in recorded.items() if not _equal(ours[t], theirs)]
     return differing, sum(len(s) for theirs in recorded.values() for s in theirs)
 
 
 def _equal(ours: list[Series], theirs: list[Series]) -> bool:
-    left, right = _by_strings(ours), _by_strings(theirs)
+    left, right = _by_kind(ours), _by_kind(theirs)
     if left.keys() != right.keys():
         return False
     for key, a in left.items():
         b = right[key]
-        if not (np.array_equal(a.stamp_ns, b.stamp_ns) and a.data.dtype.names == b.data.dtype.names):
+        if not np.array_equal(a.stamp_ns, b.stamp_ns):
             return False
         for name in a.data.dtype.names or ():
             if a.data[name].tobytes() != b.data[name].tobytes():
@@ -90,5 +93,6 @@ def _equal(ours: list[Series], theirs: list[Series]) -> bool:
     return True
 
 
-def _by_strings(series: list[Series]) -> dict[tuple[tuple[str, str], ...], Series]:
-    return {tuple(sorted(s.strings.items())): s for s in series}
+def _by_kind(series: list[Series]) -> dict[tuple[object, ...], Series]:
+    """Return series by their strings and columns, which tell those of one topic apart."""
+    return {(*sorted(s.strings.items()), str(s.data.dtype.descr)): s for s in series}

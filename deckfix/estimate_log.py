@@ -19,13 +19,14 @@ from estimation.events import AUTOPILOT
 from estimation.state import ATTITUDE, BLOCKS, NOMINAL
 
 if TYPE_CHECKING:
+    from deckfix.forecasts import Forecasts
     from deckfix.result import Result
     from estimation.estimator import Run
     from logs.reader import Flight
     from logs.recording import Series
     from logs.writer import FlightWriter
 
-OURS = ("/estimate/", "/fusion")
+OURS = ("/estimate/", "/fusion", "/heave/")
 """Topics that a replay writes; those of an earlier replay are not copied."""
 SOFTWARE = "deckfix.estimate"
 """Metadata record that tells what made the estimates."""
@@ -52,7 +53,8 @@ def write(
         copy_source(flight, writer)
         writer.add_attachment(CONFIG_NAME, "application/toml", result.config_text.encode())
         writer.add_metadata(SOFTWARE, {"software": f"deckfix {__version__}", "engine": result.run.engine})
-        writer.write_series(*estimate_series(result.run, flight.clock_offsets_ns.get(AUTOPILOT, 0)))
+        utc_offset_ns = flight.clock_offsets_ns.get(AUTOPILOT, 0)
+        writer.write_series(*estimate_series(result.run, utc_offset_ns, result.forecasts))
 
 
 def copy_source(flight: Flight, writer: FlightWriter) -> None:
@@ -85,9 +87,9 @@ def copy_source(flight: Flight, writer: FlightWriter) -> None:
         )
 
 
-def estimate_series(run: Run, utc_offset_ns: int) -> list[Series]:
-    """Return the topics of a run: odometry, the whole state, the platform where it is on, and one series of fusion
-    records a sensor.
+def estimate_series(run: Run, utc_offset_ns: int, made: Forecasts) -> list[Series]:
+    """Return the topics of a run: odometry, the whole state, the platform and its heave where they are on, and one
+    series of fusion records a sensor.
 
     Fusion records are stamped with the time of their content and logged at their arrival; ``utc_offset_ns``
     takes the inertial clock to UTC.
@@ -101,6 +103,7 @@ def estimate_series(run: Run, utc_offset_ns: int) -> list[Series]:
         out.append(odometry_series("/estimate/odometry", run.t_ns, arrival, *pose))
         out.append(state_series(run.state_names, run.t_ns, arrival, state_values(run), run.sigma))
         out.extend(_deck_series(run, arrival))
+    out.extend(_heave_series(run, utc_offset_ns, made))
     for index in np.unique(run.records["sensor"]):
         r = run.records[run.records["sensor"] == index]
         told = (r["outcome"].astype(np.uint8), r["nis"], r["dof"].astype(np.uint8))
@@ -130,6 +133,30 @@ def _deck_series(run: Run, arrival: NDArray[np.int64]) -> list[Series]:
     return [
         odometry_series("/estimate/relative", run.t_ns, arrival, *relative),
         odometry_series("/estimate/platform", run.t_ns, arrival, place, speed, level, own),
+    ]
+
+
+def _heave_series(run: Run, utc_offset_ns: int, made: Forecasts) -> list[Series]:
+    """Return the heave models and their forecasts, logged at the time that each was due."""
+    from deckfix.forecasts import QUIET_RATE_MPS, QUIET_S
+    from logs.heave import heave_forecast_series, heave_model_series
+
+    if not len(made):
+        return []
+    arrival = np.array([due for due, _ in run.heave], np.int64) + utc_offset_ns
+    columns = {
+        "heave_m": made.heave_m,
+        "heave_sigma_m": made.sigma_m,
+        "rate_mps": made.rate_mps,
+        "rate_sigma_mps": made.rate_sigma_mps,
+        "skill": made.skill,
+        "fallback": made.fallback.astype(np.float64),
+        "window_probability": made.window_probability,
+    }
+    told = (made.horizon_s, columns, QUIET_RATE_MPS, QUIET_S)
+    return [
+        *heave_model_series(made.origin_ns, arrival, [model for _, model in run.heave]),
+        heave_forecast_series(made.origin_ns, arrival, *told),
     ]
 
 

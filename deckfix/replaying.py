@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deckfix.clock_track import clock_tracks
+from deckfix.deck_reference import compare_deck, raw_fixes
 from deckfix.reference import (
     Column,
     Times,
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
 
 CONFIG_NAME = "config.toml"
 """Attachment in which a log carries the configuration that its estimates were made with."""
+LATENCY_CONVENTION = "positive: the content is older than its stamp; t_content = t_stamp - latency"
+"""What the sign of every latency that is shown means."""
 
 
 def open(path: str | Path) -> Flight:
@@ -132,7 +136,14 @@ def present(
         vibration_mps2=vibration_mps2(batch),
         source=flight,
         clocks=clock_blocks(run, config),
+        clock_tracks=clock_tracks(batch),
+        platform=platform,
+        vision_latency_s=config.vision.latency_s,
     )
+    if run.deck.shape[1]:
+        result.fixes = raw_fixes(run, batch, config)
+        if truth is not None and platform is not None:
+            result.deck_errors = compare_deck(run, truth, platform, result.judged)
     if truth is not None and len(run.t_ns) > 1:
         own = (run.t_ns, run.position_m, run.velocity_mps, run.quaternion)
         result.truth_errors = compare(*own, truth, result.judged, run.covariance)
@@ -165,6 +176,7 @@ def clock_blocks(run: Run, config: Config) -> dict[str, dict[str, Any]]:
         for values in out.values():
             values["latency_ms"], values["latency_sigma_ms"] = age * 1e3, sigma * 1e3
             values["latency_status"] = "estimated" if learned else "unobservable"
+            values["latency_convention"] = LATENCY_CONVENTION
     return out
 
 

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deckfix.clock_track import ClockTrack
+from deckfix.deck_reference import DeckErrors, RawFixes, height_seen_later, true_height
+from deckfix.forecasts import HORIZONS_S, QUIET_RATE_MPS, QUIET_S, Forecasts, Scores, forecasts, judge
 from deckfix.reference import Errors, Trajectory, Window, ratio_block, rmse_block
 from deckfix.streams import Stream
 from estimation.frames import quat_to_euler_columns
@@ -64,8 +67,9 @@ class Result:
 
     ``run`` holds the estimates and the measurements' records; ``t_s`` are seconds from ``start_ns``, the
     first inertial sample. ``truth_errors`` are at the estimates' times; ``at_autopilot`` at the
-    autopilot's; both are None where the log holds no such reference. ``source`` is the log it came from,
-    for ``write``.
+    autopilot's; both are None where the log holds no such reference, as ``deck_errors`` is. ``platform`` is the
+    platform's truth, ``fixes`` what each vision fix says by itself, ``clock_tracks`` every other clock over time,
+    ``vision_latency_s`` the configured age of a fix. ``source`` is the log it came from, for ``write``.
     """
 
     flight: str
@@ -81,7 +85,12 @@ class Result:
     autopilot: Trajectory | None = None
     truth_errors: Errors | None = None
     at_autopilot: AtReference | None = None
+    platform: Trajectory | None = None
+    deck_errors: DeckErrors | None = None
+    fixes: RawFixes | None = None
     clocks: dict[str, dict[str, Any]] = field(default_factory=dict)
+    clock_tracks: tuple[ClockTrack, ...] = ()
+    vision_latency_s: float = 0.0
     problems: tuple[str, ...] = ()
     messages: tuple[LogMessage, ...] = ()
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -104,6 +113,32 @@ class Result:
         from deckfix.estimate_log import state_values
 
         return state_values(self.run)
+
+    @cached_property
+    def has_deck(self) -> bool:
+        """True where the platform's states were on and at least one vision fix was fused."""
+        from deckfix.deck_reference import first_fix_ns
+
+        return bool(self.run.deck.shape[1]) and len(self.run.t_ns) > 1 and first_fix_ns(self.run) is not None
+
+    @cached_property
+    def forecasts(self) -> Forecasts:
+        """The forecast of every heave model of the flight."""
+        return forecasts(self.run.heave)
+
+    @cached_property
+    def forecast_scores(self) -> Scores | None:
+        """The forecasts against what happened: the truth where the log has it, else the later estimate.
+
+        None where there are none, or nothing to compare with.
+        """
+        if not len(self.forecasts):
+            return None
+        happened = true_height(self.run, self.platform) if self.platform is not None else None
+        if happened is not None:
+            return judge(self.forecasts, happened, "truth")
+        later = height_seen_later(self.run)
+        return None if later is None else judge(self.forecasts, later, "estimate")
 
     @property
     def duration_s(self) -> float:
@@ -194,6 +229,8 @@ class Result:
         }
         if self.truth_errors is not None:
             out["truth"] = {"odometry": rmse_block(self.truth_errors, self.judged)}
+            if self.deck_errors is not None:
+                out["truth"] |= self.deck_errors.blocks()
         if self.at_autopilot is not None:
             ours, theirs = self.at_autopilot.ours, self.at_autopilot.autopilot
             out["autopilot"] = rmse_block(theirs, self.judged)
@@ -205,7 +242,9 @@ class Result:
         if self.clocks:
             out["clock"] = self.clocks
         if self.run.heave:
-            out["heave"] = heave_block(self.run.heave[-1][1])
+            out["heave"] = heave_block(self.run.heave[-1][1], self.forecasts)
+            if self.forecast_scores is not None:
+                out["heave"]["forecast"] = self.forecast_scores.block()
         return out
 
     def to_pandas(self) -> pd.DataFrame:
@@ -255,17 +294,28 @@ class Result:
         write(self, path, force=force, inputs=inputs)
 
 
-def heave_block(model: HeaveModel) -> dict[str, Any]:
+def heave_block(model: HeaveModel, made: Forecasts | None = None) -> dict[str, Any]:
     """Return a heave model in the terms of the summary: components are (A [m], T [s], phi [rad]) of seed (3.6), largest
-    first, with t = 0 at the model's last fix.
+    first, with t = 0 at the model's last fix. ``made`` has the model's forecast in its last row.
     """
     largest = sorted(model.components, key=lambda c: -c[0])[:8]
+    made = forecasts([(0, model)]) if made is None else made
+    at = dict(zip(HORIZONS_S, range(len(HORIZONS_S)), strict=True))
     return {
+        "method": model.method,
+        "reason": model.reason,
         "hs_m": float(model.hs_m),
         "tp_s": float(model.tp_s),
         "dominant_period_s": float(model.dominant_period_s),
+        "level_m": float(model.level_m),
+        "level_sigma_m": float(model.level_sigma_m),
         "components": [[float(v) for v in c] for c in largest],
-        "skill": {f"{h:g}": float(model.skill(h)) for h in (0.5, 1.0, 2.0, 3.0, 5.0)},
+        "skill": {f"{h:g}": float(made.skill[-1, k]) for h, k in at.items() if h > 0},
+        "window": {
+            "rate_limit_mps": QUIET_RATE_MPS,
+            "duration_s": QUIET_S,
+            "probability": {f"{h:g}": float(made.window_probability[-1, k]) for h, k in at.items()},
+        },
     }
 
 

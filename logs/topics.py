@@ -19,6 +19,10 @@ ROS 2 tool shows them. The columns of a topic (``row_dtype``) are the message wi
 /timesync                    sent_ns, remote_ns, received_ns (int64)
 odometry topics              pose_pose_position, pose_pose_orientation, pose_covariance (36),
                              twist_twist_linear, twist_twist_angular, twist_covariance (36)
+/heave/model                 level_m, level_sigma_m, significant_height_m, peak_period_s, amplitude_m (k),
+                             period_s (k), phase_rad (k); up, t = 0 at the stamp
+/heave/forecast              horizon_s (h), heave_m (h), heave_sigma_m (h), rate_mps (h), rate_sigma_mps (h),
+                             skill (h), fallback (h), window_probability (h), window_rate_mps, window_s
 ============================ ===========================================================================
 """
 
@@ -103,15 +107,20 @@ _BODIES: Mapping[str, str] = {
     + "uint8 outcome\nfloat64 nis  # normalised innovation squared; NaN where none was formed\nuint8 dof\n"
     + "float64[3] innovation\nfloat64[3] sigma  # of the innovation; NaN beyond dof\n"
     + "float64 age_s  # time of the filter less time of the content\n",
-    "deckfix_msgs/HeaveModel": "# Heave of the deck (up): level + sum of A sin(2 pi t / T + phi).\n"
+    "deckfix_msgs/HeaveModel": "# Heave of the deck, up: level + sum of A sin(2 pi t / T + phi), t from the stamp on.\n"
     + _HEADER
-    + "float64 level_m\nfloat64 significant_height_m\nfloat64 peak_period_s\n"
+    + "string method  # bhr: a learned spectrum; sinusoids; mean: the level only\n"
+    + "float64 level_m  # above the origin, drift included, at the stamp\nfloat64 level_sigma_m\n"
+    + "float64 significant_height_m\nfloat64 peak_period_s\n"
     + "float64[] amplitude_m\nfloat64[] period_s\nfloat64[] phase_rad\n",
     "deckfix_msgs/HeaveForecast": "# Heave and heave rate (up) at each horizon from the stamp on.\n"
     + _HEADER
-    + "float64[] horizon_s\nfloat64[] heave_m\nfloat64[] heave_sigma_m\nfloat64[] rate_mps\n"
-    + "float64[] rate_sigma_mps\nfloat64[] skill  # 1 - variance / variance of the sea\n"
-    + "float64[] window_probability  # of a quiescent touchdown window\n",
+    + "float64[] horizon_s\nfloat64[] heave_m  # above the origin, level included\n"
+    + "float64[] heave_sigma_m\nfloat64[] rate_mps\nfloat64[] rate_sigma_mps\n"
+    + "float64[] skill  # 1 - variance / variance of the mean predictor\n"
+    + "uint8[] fallback  # 1: no better than the level, which is given instead\n"
+    + "float64[] window_probability  # of a quiescent window that begins there\n"
+    + "float64 window_rate_mps  # quiet: the rate stays below this\nfloat64 window_s  # for so long\n",
     "deckfix_msgs/LandingMode": _HEADER
     + "uint8 IDLE=0\nuint8 SEARCH=1\nuint8 TRACKING=2\nuint8 OBSERVATION=3\nuint8 LANDING=4\nuint8 LANDED=5\n"
     + "uint8 ABORT=6\nuint8 mode\nstring reason\n"
@@ -194,8 +203,8 @@ TOPICS: Mapping[str, Topic] = {
         Topic("/estimate/platform", _ODOMETRY, "ned", _DECK),
         Topic("/estimate/state", "deckfix_msgs/msg/FilterState", "ned"),
         Topic("/fusion", "deckfix_msgs/msg/FusionReport"),
-        Topic("/heave/model", "deckfix_msgs/msg/HeaveModel", "platform"),
-        Topic("/heave/forecast", "deckfix_msgs/msg/HeaveForecast", "platform"),
+        Topic("/heave/model", "deckfix_msgs/msg/HeaveModel", "ned", {"method": "bhr"}),
+        Topic("/heave/forecast", "deckfix_msgs/msg/HeaveForecast", "ned"),
         Topic("/landing/mode", "deckfix_msgs/msg/LandingMode", "platform"),
         Topic("/truth/odometry", _ODOMETRY, "ned", _BODY),
         Topic("/truth/platform", _ODOMETRY, "ned", _DECK),
