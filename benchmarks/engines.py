@@ -35,8 +35,9 @@ from targets import Target, Targets, provenance
 
 from deckfix.replaying import facts
 from estimation.config import Config, parse_config
-from estimation.estimator import EngineName, Facts, LandingEstimator, Run
+from estimation.estimator import EngineName, LandingEstimator
 from estimation.events import EventBatch, Kind, unpack
+from estimation.output import Facts, Run
 
 EQUAL = 1e-9
 FASTER = 15.0

@@ -45,9 +45,10 @@ from targets import Target, Targets, nis_row, nis_rows, provenance
 import deckfix
 from deckfix.reference import RATIOS, rms
 from estimation.config import Config, parse_config
-from estimation.estimator import LandingEstimator, Run
+from estimation.estimator import LandingEstimator
 from estimation.events import EventBatch, Kind
 from estimation.frames import geodetic_to_ned, quat_to_euler_columns
+from estimation.output import Run
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deckfix.result import nis_band
-from estimation.estimator import Run
+from estimation.output import Run
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,10 +23,10 @@ from deckfix.reference import (
     rmse_block,
 )
 from estimation.config import Config
-from estimation.estimator import Run
 from estimation.events import EventBatch, Kind
 from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_to_matrix
 from estimation.outcome import Outcome
+from estimation.output import Run
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]

@@ -21,7 +21,7 @@ from estimation.state import ATTITUDE, BLOCKS, NOMINAL
 if TYPE_CHECKING:
     from deckfix.forecasts import Forecasts
     from deckfix.result import Result
-    from estimation.estimator import Run
+    from estimation.output import Run
     from logs.reader import Flight
     from logs.recording import Series
     from logs.writer import FlightWriter

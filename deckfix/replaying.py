@@ -29,8 +29,9 @@ from deckfix.reference import (
 from deckfix.result import AtReference, LogMessage, Result
 from deckfix.streams import streams, vibration_mps2
 from estimation.config import Config, dump_config, load_config, parse_config
-from estimation.estimator import EngineName, Facts, LandingEstimator, Run
+from estimation.estimator import EngineName, LandingEstimator
 from estimation.events import AUTOPILOT, EventBatch, Kind
+from estimation.output import Facts, Run
 from estimation.state import CAMERA_LATENCY, NOMINAL
 
 if TYPE_CHECKING:

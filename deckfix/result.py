@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import plotly.graph_objects as go
 
-    from estimation.estimator import Run
     from estimation.heave.model import HeaveModel
+    from estimation.output import Run
     from logs.reader import Flight
 
 Array = NDArray[np.float64]

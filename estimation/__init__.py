@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from estimation.config import Config, ConfigError, dump_config, load_config, parse_config
-    from estimation.estimator import Estimate, Facts, LandingEstimator, Output, Run
+    from estimation.estimator import LandingEstimator
     from estimation.events import EventBatch
     from estimation.outcome import Outcome
+    from estimation.output import Estimate, Facts, Output, Run
 
 _HOME = {
     "Config": "config",
@@ -19,11 +20,11 @@ _HOME = {
     "dump_config": "config",
     "load_config": "config",
     "parse_config": "config",
-    "Estimate": "estimator",
-    "Facts": "estimator",
+    "Estimate": "output",
+    "Facts": "output",
     "LandingEstimator": "estimator",
-    "Output": "estimator",
-    "Run": "estimator",
+    "Output": "output",
+    "Run": "output",
     "EventBatch": "events",
     "Outcome": "outcome",
 }

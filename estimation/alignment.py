@@ -93,6 +93,16 @@ class Aligned:
     note: str
 
 
+@dataclass(frozen=True, slots=True)
+class FirstAttitude:
+    """Body-to-NED quaternion, 1-sigma of its yaw [rad], whether that came from the magnetometer, and in words."""
+
+    q: Array
+    yaw_sigma: float
+    magnetic: bool
+    note: str
+
+
 @dataclass(slots=True)
 class Aligner:
     """Collects what a start needs. ``site`` is kept from an earlier start of the same flight, if there was one."""
@@ -274,8 +284,7 @@ class Aligner:
         attitude = self._first_attitude(t, window, rest, site)
         if attitude is None:
             return None
-        q, yaw_sigma, how = attitude
-        return Aligned(site, self._state(t, q, yaw_sigma, rest, velocity, site, how), how)
+        return Aligned(site, self._state(t, attitude, rest, velocity, site), attitude.note)
 
     def _site(self) -> Site:
         assert self._fix is not None
@@ -292,14 +301,12 @@ class Aligner:
             declination = world_magnetic_declination(latitude, longitude, altitude, self.utc_s)
         return Site((latitude, longitude, altitude), declination)
 
-    def _first_attitude(
-        self, t: int, window: Array, rest: bool, site: Site
-    ) -> tuple[Array, float, str] | None:
+    def _first_attitude(self, t: int, window: Array, rest: bool, site: Site) -> FirstAttitude | None:
         c = self.config
         sigma = c.initialisation.yaw_sigma_rad
         attitude = self._attitude_now(t)
         if not rest and attitude is not None:
-            return attitude, sigma, "in flight, from the autopilot's attitude"
+            return FirstAttitude(attitude, sigma, False, "in flight, from the autopilot's attitude")
         gravity = np.array([0.0, 0.0, normal_gravity(site.origin[0], site.origin[2])])
         force, up = window[:, 3:].mean(axis=0), -gravity
         if not rest:
@@ -311,16 +318,20 @@ class Aligner:
             if t - self._mag[0] > FRESH_NS or turned is None:
                 return None
             q = _attitude_from_field(force, up, turned.T @ self._mag[1], site.declination_rad)
-            return None if q is None else (q, sigma, f"{where}, heading from the magnetometer")
+            if q is None:
+                return None
+            return FirstAttitude(q, sigma, True, f"{where}, heading from the magnetometer")
         if attitude is not None:
             yaw = float(quat_to_euler(attitude)[2])
-            return _attitude_from(force, up, yaw), sigma, f"{where}, heading from the autopilot's attitude"
+            q = _attitude_from(force, up, yaw)
+            return FirstAttitude(q, sigma, False, f"{where}, heading from the autopilot's attitude")
         found = self._heading_from_motion()
         if found is None or found[1] > c.initialisation.motion_yaw_sigma_rad or self._level is None:
             return None
         turn = euler_to_quat(0.0, 0.0, found[0])
         q = quat_normalise(quat_multiply(turn, self._level))
-        return q, max(sigma, 1.5 * found[1]), "in flight, heading from horizontal acceleration"
+        sigma = max(sigma, 1.5 * found[1])
+        return FirstAttitude(q, sigma, False, "in flight, heading from horizontal acceleration")
 
     def _attitude_now(self, t: int) -> Array | None:
         """Return the autopilot's last attitude, turned on to now with the gyro; None without a recent one."""
@@ -375,12 +386,11 @@ class Aligner:
         a = (v1 - v0) / span
         return self._impulse_between(t0, t1) / span, np.where(np.isfinite(a), a, 0.0)
 
-    def _state(
-        self, t: int, q: Array, yaw_sigma: float, rest: bool, velocity: Array, site: Site, how: str
-    ) -> FilterState:
+    def _state(self, t: int, first: FirstAttitude, rest: bool, velocity: Array, site: Site) -> FilterState:
         assert self._fix is not None
         c, o = self.config, self.layout.offsets
         window = self._window()
+        q, yaw_sigma = first.q, first.yaw_sigma
         x = nominal_zero()
         fix_t, fix, own = self._fix
         up_to_date = np.where(np.isfinite(velocity), velocity, 0.0)
@@ -417,7 +427,7 @@ class Aligner:
         tilt = c.initialisation.tilt_sigma_rad if rest else c.initialisation.flight_tilt_sigma_rad
         a = int(o[ATTITUDE])
         errors = np.eye(3)
-        if self._mag is not None and "magnetometer" in how:
+        if first.magnetic and self._mag is not None:
             # A tilt error turns the field's steep part into a heading error: that of the yaw hangs on the tilt's.
             field_n = R @ self._mag[1]
             dip = field_n[2] / max(math.hypot(field_n[0], field_n[1]), 1e-12)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from estimation.ahead import DeckForecast, DeckForecaster
 from estimation.alignment import Aligner
-from estimation.clockbank import ClockBank, ClockSummary
+from estimation.clockbank import ClockBank
 from estimation.config import Config, ConfigError
 from estimation.deck import HEAVE_SIZE
 from estimation.events import (
@@ -34,34 +34,16 @@ from estimation.frames import Array
 from estimation.heave.model import HeaveModel
 from estimation.history import Engine, History
 from estimation.learning import HeaveLearner
+from estimation.ledger import Ledger
 from estimation.outcome import Outcome
+from estimation.output import Facts, Output, Run, estimate_at
 from estimation.parameters import Site, pack_parameters
 from estimation.rows import HEAVE_MODEL, PENDING, Estimates, FilterState, Int, Rows
+from estimation.screening import malformed
 from estimation.state import BA0, BG0, P0, PH0, PLATFORM_HEAVE, Q0, V0, Layout
 
 EngineName = Literal["auto", "filterpy", "compiled"]
 
-RECORD_DTYPE = np.dtype(
-    [
-        ("t_ns", np.int64),
-        ("stamp_ns", np.int64),
-        ("arrival_ns", np.int64),
-        ("sensor", np.int16),
-        ("outcome", np.int16),
-        ("dof", np.int16),
-        ("nis", np.float64),
-        ("innovation", np.float64, (3,)),
-        ("sigma", np.float64, (3,)),
-        ("age_s", np.float64),
-    ]
-)
-"""One fusion attempt: time of the content on the estimator's clock, the event's own stamp and arrival, the sensor's
-index, ``Outcome``, degrees of freedom, NIS, innovation with its predicted 1-sigma (NaN where there was no
-comparison), and the age at arrival."""
-
-MAX_RATE_RADPS = 100.0
-MAX_FORCE_MPS2 = 1000.0
-"""No inertial sensor of a multirotor reads beyond these: such a sample is rejected as outside the gate."""
 REWIND_SPAN_NS = 200_000_000
 REWIND_COUNT = 20
 """An inertial clock has gone back when this many samples over this span all are too old."""
@@ -73,90 +55,6 @@ LOOK_AHEAD_LEARNING = 32
 """The same where the heave is learned on the way."""
 TAKE_UP_NS = 600_000_000
 """How long after its fixes are final a heave model is taken up by the filter."""
-
-MEASURED_3D = (Kind.GPS_POSITION, Kind.GPS_VELOCITY, Kind.VISION)
-
-
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """What the source of the events knows beforehand, used where the configuration leaves it open.
-
-    ``imu_latency_s`` is the age of an inertial sample at its stamp (filter delay); ``declination_rad`` is east
-    positive.
-    """
-
-    imu_latency_s: float = 0.0
-    declination_rad: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """The vehicle at ``t_ns`` of the inertial clock.
-
-    ``position_m`` and ``velocity_mps`` are NED from the origin, ``quaternion`` takes body to NED, ``covariance``
-    (9, 9) is of position, velocity and attitude error (rotation vector in the body frame). ``sigma`` has the
-    1-sigma of every entry of the error state, ``nominal`` the whole state (``estimation.state``). ``deck`` (8,) and
-    ``deck_covariance`` (8, 8) are what ``estimation.deck.deck_output`` gives, empty where the platform is off.
-    """
-
-    t_ns: int
-    position_m: Array
-    velocity_mps: Array
-    quaternion: Array
-    covariance: Array
-    nominal: Array
-    sigma: Array
-    deck: Array
-    deck_covariance: Array
-
-
-@dataclass(slots=True)
-class Output:
-    """What one event led to: an estimate (after an inertial sample), records that became final, notes."""
-
-    estimate: Estimate | None
-    records: NDArray[np.void]
-    notes: list[tuple[int, str]]
-
-
-@dataclass(slots=True)
-class Run:
-    """What a batch led to, as columns of n estimates.
-
-    ``t_ns`` inertial clock; ``position_m``, ``velocity_mps`` (n, 3) NED; ``quaternion`` (n, 4) body to NED;
-    ``covariance`` (n, 9, 9) of position, velocity and attitude error (body frame); ``gyro_bias``, ``accel_bias``
-    (n, 3); ``deck`` (n, 8) what ``estimation.deck.deck_output`` gives with ``deck_covariance`` (n, 8, 8), of no columns
-    where the platform is off; ``heave`` the heave models, each with the time of its last fix;
-    ``clocks`` every other clock against the inertial one; ``nominal`` (n, NOMINAL_SIZE) and ``sigma`` (n, k) with
-    ``state_names`` and ``state_units``. ``records`` has
-    ``RECORD_DTYPE``; ``sensors`` are the names that its indices mean; ``notes`` are (t_ns, sentence).
-    ``imu_outcomes`` counts the inertial samples. ``origin`` is latitude [rad], longitude [rad], altitude [m], or
-    None where the filter never started; ``missing`` says then what it waited for.
-    """
-
-    engine: str
-    t_ns: Int
-    position_m: Array
-    velocity_mps: Array
-    quaternion: Array
-    covariance: Array
-    gyro_bias: Array
-    accel_bias: Array
-    nominal: Array
-    sigma: Array
-    state_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    deck: Array
-    deck_covariance: Array
-    heave: list[tuple[int, HeaveModel]]
-    clocks: list[ClockSummary]
-    records: NDArray[np.void]
-    sensors: tuple[str, ...]
-    notes: list[tuple[int, str]]
-    imu_outcomes: dict[Outcome, int]
-    origin: tuple[float, float, float] | None
-    declination_rad: float | None
-    missing: str
 
 
 @dataclass(slots=True)
@@ -185,9 +83,7 @@ class LandingEstimator:
     _period_ns: int = field(init=False)
     _past: list[tuple[int, int]] = field(default_factory=list)
     _estimates: list[Estimates] = field(default_factory=list)
-    _settled: list[Rows] = field(default_factory=list)
-    _notes: list[tuple[int, str]] = field(default_factory=list)
-    _imu_outcomes: dict[Outcome, int] = field(default_factory=dict)
+    _ledger: Ledger = field(default_factory=Ledger)
     _learner: HeaveLearner | None = None
     _heave: list[tuple[int, HeaveModel]] = field(default_factory=list)
     _utc_s: float = 0.0
@@ -282,10 +178,10 @@ class LandingEstimator:
             self._not_ready(h.size)
             return
         self._advance()
-        self._settle(h.settle(everything=True))
+        self._ledger.keep(h.settle(everything=True))
         rest = h.rows.take(np.arange(h.size))
         rest.outcome[:] = Outcome.REJECTED_FUTURE
-        self._settle(rest)
+        self._ledger.keep(rest)
         h.drop(h.size)
 
     # -- intake ------------------------------------------------------------------------------------------------
@@ -310,11 +206,11 @@ class LandingEstimator:
         r.t_ns[:], r.kind[:], r.sensor[:], r.id[:] = t, rows["kind"], rows["sensor"], ids
         r.stamp_ns[:], r.arrival_ns[:] = rows["stamp_ns"], rows["arrival_ns"]
         r.value[:], r.own[:] = rows["value"], rows["covariance"]
-        r.outcome[:] = _malformed(r)
+        r.outcome[:] = malformed(r)
         r.outcome[~known] = Outcome.REJECTED_NOT_READY
         r = r.take(np.flatnonzero(r.kind != Kind.TIMESYNC))
         bad = r.outcome != PENDING
-        self._reject(r.take(np.flatnonzero(bad)))
+        self._ledger.reject(r.take(np.flatnonzero(bad)))
         self._feed(r.take(np.flatnonzero(~bad)))
 
     def _content_times(
@@ -377,7 +273,7 @@ class LandingEstimator:
             if too_old[0]:
                 if self._clock_went_back(int(t[0])):
                     continue
-                self._reject_as(r.take(slice(i, i + 1)), Outcome.REJECTED_TOO_OLD)
+                self._ledger.reject(r.take(slice(i, i + 1)), Outcome.REJECTED_TOO_OLD)
                 i += 1
                 continue
             # A run of late events: put all in place, rewind once, when the next inertial sample comes.
@@ -394,7 +290,7 @@ class LandingEstimator:
         future = (rows.t_ns > newest + h.window_ns) & (rows.kind != Kind.IMU)
         for mask, outcome in ((too_old, Outcome.REJECTED_TOO_OLD), (future, Outcome.REJECTED_FUTURE)):
             if mask.any():
-                self._reject_as(rows.take(np.flatnonzero(mask)), outcome)
+                self._ledger.reject(rows.take(np.flatnonzero(mask)), outcome)
         good = ~(too_old | future)
         rows = rows if good.all() else rows.take(np.flatnonzero(good))
         imu = rows.kind == Kind.IMU
@@ -404,7 +300,9 @@ class LandingEstimator:
             self._past.clear()
         repeated = h.insert(rows)
         if len(repeated):
-            self._reject_as(rows.take(np.flatnonzero(np.isin(rows.id, repeated))), Outcome.REJECTED_DUPLICATE)
+            self._ledger.reject(
+                rows.take(np.flatnonzero(np.isin(rows.id, repeated))), Outcome.REJECTED_DUPLICATE
+            )
 
     def _advance(self) -> None:
         h = self._history
@@ -417,7 +315,7 @@ class LandingEstimator:
         if out.count:
             self._estimates.append(out.filled())
         settled = h.settle()
-        self._settle(settled)
+        self._ledger.keep(settled)
         if self._learner is not None and len(settled):
             self._learn(settled)
 
@@ -447,7 +345,7 @@ class LandingEstimator:
             newest = t
         row.age_ns[0] = newest - t
         if h.newest_ns is None and not imu:
-            self._reject_as(row, Outcome.REJECTED_NOT_READY)
+            self._ledger.reject(row, Outcome.REJECTED_NOT_READY)
             return
         self._insert(row, np.array([newest]), old)
         if not imu or h.newest_ns is None:
@@ -465,7 +363,7 @@ class LandingEstimator:
         self._consumed = 0
         self._site = aligned.site
         self._engine = self._start(aligned.state)
-        self._notes.append((int(aligned.state.clock[0]), f"initialised {aligned.note}"))
+        self._ledger.note(int(aligned.state.clock[0]), f"initialised {aligned.note}")
         self._not_ready(at)
         h.begin(self._engine, 0)
         h.emitted_ns = max(h.emitted_ns, h.newest_ns - 1)
@@ -494,9 +392,9 @@ class LandingEstimator:
         t = h.newest_ns or 0
         bias = None
         if self._engine is not None:
-            self._settle(h.settle(everything=True))
+            self._ledger.keep(h.settle(everything=True))
             bias = self._engine.state.x[BG0 : BG0 + 3].copy()
-        self._notes.append((t, f"{why}: aligning again"))
+        self._ledger.note(t, f"{why}: aligning again")
         h.drop(h.size)
         h.checkpoints.clear()
         self._engine = None
@@ -518,69 +416,25 @@ class LandingEstimator:
         self._history.emitted_ns = t
         return True
 
-    # -- records -----------------------------------------------------------------------------------------------
+    # -- results -----------------------------------------------------------------------------------------------
 
     def _not_ready(self, count: int) -> None:
         """Forget the first rows of the history, which came before the filter was ready."""
         rows = self._history.rows.take(np.arange(count))
         rows.outcome[:] = np.where(rows.kind == Kind.IMU, Outcome.FUSED, Outcome.REJECTED_NOT_READY)
-        rows.result[:] = 0.0
-        self._settle(rows)
+        self._ledger.reject(rows)
         self._history.drop(count)
-
-    def _reject_as(self, rows: Rows, outcome: Outcome) -> None:
-        rows.outcome[:] = outcome
-        self._reject(rows)
-
-    def _reject(self, rows: Rows) -> None:
-        rows.result[:] = 0.0
-        self._settle(rows)
-
-    def _settle(self, rows: Rows) -> None:
-        """Keep rows whose outcome is final."""
-        if len(rows):
-            self._settled.append(rows)
-
-    def _final_records(self) -> NDArray[np.void]:
-        """Turn the rows that were kept into records; count the inertial samples, note the resets."""
-        if not self._settled:
-            return np.empty(0, dtype=RECORD_DTYPE)
-        rows = Rows(
-            np.concatenate([r.ints for r in self._settled]), np.concatenate([r.floats for r in self._settled])
-        )
-        self._settled.clear()
-        imu = rows.kind == Kind.IMU
-        for outcome, count in zip(*np.unique(rows.outcome[imu], return_counts=True), strict=True):
-            key = Outcome.FUSED if outcome == PENDING else Outcome(int(outcome))
-            self._imu_outcomes[key] = self._imu_outcomes.get(key, 0) + int(count)
-        kept = ~imu | (rows.outcome > Outcome.DOWNWEIGHTED)
-        r = rows.take(np.flatnonzero(kept & (rows.kind != HEAVE_MODEL)))
-        records = np.zeros(len(r), dtype=RECORD_DTYPE)
-        records["t_ns"], records["stamp_ns"], records["arrival_ns"] = r.t_ns, r.stamp_ns, r.arrival_ns
-        records["sensor"], records["outcome"] = r.sensor, r.outcome
-        records["dof"] = r.result[:, 1]
-        records["nis"] = np.where(r.result[:, 1] > 0, r.result[:, 0], np.nan)
-        axis = np.arange(3) < r.result[:, 1:2]
-        records["innovation"] = np.where(axis, r.result[:, 2:5], np.nan)
-        records["sigma"] = np.where(axis, r.result[:, 5:8], np.nan)
-        records["age_s"] = r.age_ns * 1e-9
-        for i in np.flatnonzero(r.reset):
-            name, size = self._names.sensors[int(r.sensor[i])], float(np.linalg.norm(r.result[i, 2:5]))
-            text = f"{name} contradicted the filter, but not itself, for long: moved onto it by {size:.1f}"
-            self._notes.append((int(r.t_ns[i]), text))
-        return records
 
     def _output(self) -> Output:
         estimates, records, notes = self._collect()
         last = estimates.count - 1
-        return Output(_estimate(estimates, last) if last >= 0 else None, records, notes)
+        return Output(estimate_at(estimates, last) if last >= 0 else None, records, notes)
 
     def _collect(self) -> tuple[Estimates, NDArray[np.void], list[tuple[int, str]]]:
         estimates = Estimates.concatenate(self._estimates, self.layout)
-        records = self._final_records()
-        notes = list(self._notes)
+        records = self._ledger.take_records(self._names)
+        notes = self._ledger.take_notes()
         self._estimates.clear()
-        self._notes.clear()
         return estimates, records, notes
 
     def _as_run(self, e: Estimates, records: NDArray[np.void], notes: list[tuple[int, str]]) -> Run:
@@ -606,7 +460,7 @@ class LandingEstimator:
             records=records,
             sensors=tuple(self._names.sensors),
             notes=notes,
-            imu_outcomes=dict(self._imu_outcomes),
+            imu_outcomes=dict(self._ledger.imu_outcomes),
             origin=self._site.origin if self._site else None,
             declination_rad=self._site.declination_rad if self._site else None,
             missing="" if self._engine is not None else self._aligner.missing,
@@ -623,42 +477,3 @@ def _choose(engine: EngineName) -> str:
     if engine == "compiled" and not numba:
         raise ConfigError("engine 'compiled' needs numba; install deckfix[fast] or use engine 'filterpy'")
     return "compiled" if engine != "filterpy" and numba else "filterpy"
-
-
-def _malformed(rows: Rows) -> Int:
-    """Return for each row the outcome of a measurement that is malformed in itself, or ``PENDING``."""
-    outcome = np.full(len(rows), PENDING, dtype=np.int64)
-    needed = np.array([6, 0, 3, 2, 1, 3, 4, 1, 3, 1])[rows.kind]
-    used = np.arange(6) < needed[:, None]
-    imu = rows.kind == Kind.IMU
-    with np.errstate(invalid="ignore"):
-        beyond = (np.abs(rows.value[:, :3]) > MAX_RATE_RADPS) | (np.abs(rows.value[:, 3:]) > MAX_FORCE_MPS2)
-    outcome[imu & beyond.any(axis=1)] = Outcome.REJECTED_GATE
-    outcome[(used & ~np.isfinite(rows.value)).any(axis=1)] = Outcome.REJECTED_NOT_FINITE
-    c = rows.own
-    stated = ~np.isnan(c).all(axis=1) & np.isin(rows.kind, MEASURED_3D)
-    if stated.any():
-        a, b, d, e, f, g = c.T
-        with np.errstate(all="ignore"):
-            minor = a * e - b * b
-            det = a * (e * g - f * f) - b * (b * g - f * d) + d * (b * f - e * d)
-            positive = (a > 0) & (minor > 0) & (det > 0)
-        # A receiver without a vertical velocity states no variance for it.
-        planar = (rows.kind == Kind.GPS_VELOCITY) & np.isnan(g) & (a > 0) & (e > 0)
-        outcome[stated & ~positive & ~planar & (outcome == PENDING)] = Outcome.REJECTED_COVARIANCE
-    return outcome
-
-
-def _estimate(e: Estimates, i: int) -> Estimate:
-    x = e.x[i]
-    return Estimate(
-        int(e.t_ns[i]),
-        x[P0 : P0 + 3],
-        x[V0 : V0 + 3],
-        x[Q0 : Q0 + 4],
-        e.covariance[i],
-        x,
-        e.sigma[i],
-        e.deck[i],
-        e.deck_covariance[i],
-    )

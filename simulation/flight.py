@@ -21,9 +21,9 @@ import numpy as np
 
 from estimation.alignment import world_magnetic_declination
 from estimation.config import Config, ConfigError, dump_config, parse_config
-from estimation.estimator import Facts
 from estimation.events import AUTOPILOT, EventBatch
 from estimation.frames import normal_gravity
+from estimation.output import Facts
 from logs.events import series_of_batch
 from logs.recording import Recording, Series
 from logs.sensors import Times, odometry_series

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.consistency import RunsConsistency, normalised_squared, runs_consistency
-from estimation.estimator import EngineName, LandingEstimator, Run
+from estimation.estimator import EngineName, LandingEstimator
 from estimation.frames import geodetic_to_ned, quat_conjugate, quat_log, quat_multiply
+from estimation.output import Run
 from estimation.state import BLOCKS, NOMINAL
 from simulation.flight import Scenario, SimulatedFlight, simulate
 from simulation.jets import Array

@@ -11,10 +11,10 @@ from deckfix.reference import Column, Trajectory, compare, window
 from deckfix.result import AtReference, LogMessage, Result
 from deckfix.streams import stream
 from estimation.config import Config
-from estimation.estimator import RECORD_DTYPE, Run
 from estimation.events import Kind
 from estimation.frames import euler_to_quat
 from estimation.outcome import Outcome
+from estimation.output import RECORD_DTYPE, Run
 from estimation.state import NOMINAL_SIZE, Layout
 
 T0 = 41_550_000_000

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from estimation.estimator import LandingEstimator, Run
+from estimation.estimator import LandingEstimator
 from estimation.events import EventBatch
 from estimation.frames import Array
 from estimation.outcome import Outcome
+from estimation.output import Run
 from simulation import faults
 from simulation.flight import SimulatedFlight, load_scenario, simulate
 from simulation.montecarlo import kinematic_errors

@@ -10,9 +10,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from estimation.config import Config, parse_config
-from estimation.estimator import LandingEstimator, Run
+from estimation.estimator import LandingEstimator
 from estimation.events import EVENT_DTYPE, EventBatch, Kind
 from estimation.outcome import Outcome
+from estimation.output import Run
 
 SENSORS = ("imu", "gps_position", "gps_velocity", "barometer", "magnetometer")
 DURATION_S = 4.0

@@ -11,8 +11,9 @@ import pytest
 import deckfix
 from deckfix.replaying import facts
 from estimation.config import Config, parse_config
-from estimation.estimator import Facts, LandingEstimator
+from estimation.estimator import LandingEstimator
 from estimation.outcome import Outcome
+from estimation.output import Facts
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
