@@ -33,6 +33,10 @@ def _not_negative(description: str, unit: str) -> Meta:
     return Meta(ge=0.0, description=description, extra={"unit": unit})
 
 
+def _share(description: str) -> Meta:
+    return Meta(gt=0.0, lt=1.0, description=description, extra={"unit": "-"})
+
+
 def _choice(description: str) -> Meta:
     return Meta(description=description, extra={"unit": "-"})
 
@@ -277,6 +281,145 @@ class PlatformConfig(_Table, frozen=True):
     learn_window_s: Annotated[float, _positive("how much of the past it is learned from", "s")] = 60.0
 
 
+class LandingConfig(_Table, frozen=True):
+    """The landing modes: search, tracking, observation, landing, abort (``estimation.landing``)."""
+
+    search_altitude_m: Annotated[
+        float | None,
+        _number(
+            "height above the mean level that is searched from; None: seed (3.4) from the values below", "m"
+        ),
+    ] = None
+    anchor_radius_m: Annotated[
+        float, _positive("r_anchor: the platform is found within this distance of the anchor", "m")
+    ] = 2.0
+    gps_horizontal_error_m: Annotated[
+        float, _not_negative("H_error: largest horizontal GPS error that the search allows for", "m")
+    ] = 2.0
+    gps_vertical_error_m: Annotated[
+        float, _not_negative("V_error: largest vertical GPS error that the search allows for", "m")
+    ] = 5.0
+    field_of_view_rad: Annotated[
+        float,
+        Meta(
+            gt=0.05,
+            lt=3.0,
+            description="the smaller of the camera's angles of view; the default is 48.8 deg",
+            extra={"unit": "rad"},
+        ),
+    ] = 0.852
+    track_share: Annotated[
+        float,
+        Meta(
+            gt=0.0,
+            lt=1.0,
+            description="alpha_track: tracking altitude over search altitude (seed 3.2.2)",
+            extra={"unit": "-"},
+        ),
+    ] = 0.5
+    r_track_m: Annotated[
+        float, _positive("r_track: circle about the target in tracking and observation (seed 3.5)", "m")
+    ] = 1.0
+    r_land_m: Annotated[
+        float, _positive("r_land: circle about the target to touch down in, at most r_track (seed 3.7)", "m")
+    ] = 0.5
+    track_probability: Annotated[
+        float, _share("being inside r_track must be this probable before the deck is observed")
+    ] = 0.95
+    land_probability: Annotated[
+        float, _share("being inside r_land must be this probable before the vehicle goes down")
+    ] = 0.95
+    abort_probability: Annotated[
+        float,
+        _share(
+            "below this probability of being inside, the descent is broken off (and the observation begun anew)"
+        ),
+    ] = 0.7
+    track_tilt_rad: Annotated[
+        float,
+        _positive(
+            "bound of roll and pitch while the target is in view: they spoil a fix (seed 5.6.3); 15 deg",
+            "rad",
+        ),
+    ] = 0.26
+    land_tilt_rad: Annotated[
+        float,
+        _positive(
+            "bound of roll and pitch on the way down; level would let the wind carry the vehicle away; 11 deg",
+            "rad",
+        ),
+    ] = 0.2
+    abort_tilt_rad: Annotated[
+        float, _positive("a tilt beyond this breaks the descent off; 20 deg", "rad")
+    ] = 0.35
+    observe_s: Annotated[float, _positive("shortest observation of the deck, t_0 to t_N", "s")] = 12.0
+    observe_max_s: Annotated[
+        float,
+        _positive(
+            "longest observation: then the landing goes on without a forecast that has skill; not below observe_s",
+            "s",
+        ),
+    ] = 45.0
+    skill: Annotated[
+        float, _share("skill that the forecast of the deck's rate must have at skill_horizon_s")
+    ] = 0.4
+    skill_horizon_s: Annotated[float, _positive("horizon at which the skill is judged", "s")] = 0.5
+    hold_height_m: Annotated[
+        float, _positive("height above the deck at which a quiet moment is waited for", "m")
+    ] = 0.8
+    gear_m: Annotated[
+        float,
+        _not_negative("height of the inertial sensor above the deck when the vehicle stands on it", "m"),
+    ] = 0.1
+    blind_height_m: Annotated[
+        float, _not_negative("height above the deck below which the target need not be in view any more", "m")
+    ] = 0.5
+    approach_rate_mps: Annotated[
+        float,
+        Meta(
+            gt=0.0,
+            le=0.5,
+            description="largest descent rate relative to the deck (seed 3.2.4 bounds it by 0.5)",
+            extra={"unit": "m/s"},
+        ),
+    ] = 0.5
+    touchdown_rate_mps: Annotated[
+        float,
+        _positive("descent rate relative to the deck down to contact; not above approach_rate_mps", "m/s"),
+    ] = 0.25
+    quiet_rate_mps: Annotated[float, _positive("the deck is quiet while its rate is below this", "m/s")] = 0.3
+    quiet_probability: Annotated[
+        float, _share("probability of a quiet deck at contact that the descent waits for")
+    ] = 0.8
+    wait_s: Annotated[
+        float,
+        _positive(
+            "longest wait for it: the probability asked for falls to zero over this time, since batteries do not wait",
+            "s",
+        ),
+    ] = 20.0
+    response_s: Annotated[
+        float,
+        _not_negative(
+            "lag of the vehicle's velocity behind its set-point: how far ahead the deck's rate is commanded",
+            "s",
+        ),
+    ] = 0.3
+    lost_s: Annotated[float, _positive("the target is lost after this time without a fused fix", "s")] = 1.0
+    stale_s: Annotated[float, _positive("an estimate older than this is not flown on", "s")] = 0.3
+    sigma_limit_m: Annotated[
+        float, _positive("a position whose horizontal 1-sigma exceeds this is not flown on", "m")
+    ] = 5.0
+    speed_mps: Annotated[float, _positive("largest horizontal speed relative to the target", "m/s")] = 4.0
+    climb_mps: Annotated[float, _positive("largest climb rate, and that of an abort", "m/s")] = 2.0
+    position_gain: Annotated[float, _positive("velocity asked for over the position's error", "1/s")] = 0.8
+    search_s: Annotated[float, _positive("longest search over the anchor before it is given up", "s")] = 60.0
+    attempts: Annotated[
+        int,
+        Meta(ge=1, description="descents that are tried before the landing is given up", extra={"unit": "-"}),
+    ] = 4
+
+
 class FilterConfig(_Table, frozen=True):
     """The filter itself."""
 
@@ -341,6 +484,7 @@ class Config(_Table, frozen=True):
     rangefinder: RangefinderConfig = RangefinderConfig()
     vision: VisionConfig = VisionConfig()
     platform: PlatformConfig = PlatformConfig()
+    landing: LandingConfig = LandingConfig()
     filter: FilterConfig = FilterConfig()
     initialisation: InitialisationConfig = InitialisationConfig()
 
@@ -351,6 +495,18 @@ class Config(_Table, frozen=True):
             raise ConfigError("origin: give latitude_deg, longitude_deg and altitude_m, or none of them")
         if self.filter.huber_sigma > self.filter.gate_sigma:
             raise ConfigError("filter.huber_sigma is above filter.gate_sigma; make it smaller")
+        if self.landing.search_altitude_m is not None and not self.landing.search_altitude_m > 0.0:
+            raise ConfigError("landing.search_altitude_m is not above the sea; give a positive height")
+        for small, large in (
+            ("r_land_m", "r_track_m"),
+            ("touchdown_rate_mps", "approach_rate_mps"),
+            ("observe_s", "observe_max_s"),
+            ("abort_probability", "land_probability"),
+            ("gear_m", "blind_height_m"),
+            ("blind_height_m", "hold_height_m"),
+        ):
+            if getattr(self.landing, small) > getattr(self.landing, large):
+                raise ConfigError(f"landing.{small} is above landing.{large}; make it smaller")
         for table in self.__struct_fields__:
             for name in getattr(self, table).__struct_fields__:
                 value = getattr(getattr(self, table), name)

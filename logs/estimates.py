@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.events import AUTOPILOT
+from estimation.landing import Decision
 from logs.recording import Series
 from logs.topics import TOPICS, new_rows
 
@@ -168,6 +169,28 @@ def fusion_series(
     data["innovation"], data["sigma"], data["age_s"] = innovation, sigma, age_s
     metadata = {"sensor": sensor}
     return Series("/fusion", stamp_ns, arrival_ns, data, clock, sensor, {"sensor": sensor}, metadata)
+
+
+def landing_series(
+    stamp_ns: I64, arrival_ns: I64, decisions: Sequence[Decision], *, clock: str = AUTOPILOT
+) -> list[Series]:
+    """Return what the landing decided as ``/landing/mode``: a series for each reason, whose strings are constant."""
+    known = TOPICS["/landing/mode"]
+    made = []
+    reasons = np.array([str(d.reason) for d in decisions])
+    for reason in dict.fromkeys(reasons.tolist()):
+        rows = np.flatnonzero(reasons == reason)
+        data = new_rows("/landing/mode", len(rows))
+        for row, k in zip(data, rows.tolist(), strict=True):
+            d = decisions[k]
+            row["mode"], row["setpoint"], row["velocity"] = int(d.mode), d.relative_m, d.velocity_mps
+            row["setpoint_yaw_rad"] = d.yaw_rad
+            row["inside_probability"], row["quiet_probability"] = d.inside_probability, d.quiet_probability
+        strings = {"reason": reason}
+        made.append(
+            Series(known.name, stamp_ns[rows], arrival_ns[rows], data, clock, known.frame_id, strings)
+        )
+    return made
 
 
 def static_transforms(

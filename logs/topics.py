@@ -35,11 +35,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.landing import Mode
 from estimation.outcome import EXPLANATIONS, Outcome
 from logs.cdr import Given, layout
 from logs.definition import Definition, parse, short_name
 
 _HEADER = "std_msgs/Header header\n"
+_MODES = "".join(f"uint8 {m.name}={m.value}\n" for m in Mode)
 _OUTCOMES = "".join(f"uint8 {o.name}={o.value}  # {EXPLANATIONS[o]}\n" for o in Outcome)
 
 _BODIES: Mapping[str, str] = {
@@ -121,11 +123,14 @@ _BODIES: Mapping[str, str] = {
     + "uint8[] fallback  # 1: no better than the level, which is given instead\n"
     + "float64[] window_probability  # of a quiescent window that begins there\n"
     + "float64 window_rate_mps  # quiet: the rate stays below this\nfloat64 window_s  # for so long\n",
-    "deckfix_msgs/LandingMode": _HEADER
-    + "uint8 IDLE=0\nuint8 SEARCH=1\nuint8 TRACKING=2\nuint8 OBSERVATION=3\nuint8 LANDING=4\nuint8 LANDED=5\n"
-    + "uint8 ABORT=6\nuint8 mode\nstring reason\n"
-    + "geometry_msgs/Point setpoint  # relative to the platform, NED [m]\nfloat64 setpoint_yaw_rad\n"
-    + "float64 inside_probability  # of being inside the landing radius\n",
+    "deckfix_msgs/LandingMode": "# What the landing is at, why, and the velocity that it asks for.\n"
+    + _HEADER
+    + _MODES
+    + "uint8 mode\nstring reason  # what led to the mode\n"
+    + "geometry_msgs/Point setpoint  # place aimed at, relative to the platform, NED [m]\n"
+    + "geometry_msgs/Vector3 velocity  # asked for, NED [m/s]\nfloat64 setpoint_yaw_rad\n"
+    + "float64 inside_probability  # of being inside the circle that counts; NaN where none does\n"
+    + "float64 quiet_probability  # of a quiet deck at contact; NaN where it is not asked\n",
 }
 
 _RULE = "=" * 80

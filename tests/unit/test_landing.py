@@ -1,0 +1,186 @@
+"""The landing modes: the seed's numbers, and one landing from the search to contact."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimation.ahead import DeckForecast
+from estimation.config import Config, ConfigError, LandingConfig, parse_config
+from estimation.frames import euler_to_quat
+from estimation.landing import (
+    EXPLANATIONS,
+    Decision,
+    Mode,
+    Progress,
+    Reason,
+    Situation,
+    search_altitude_m,
+    step,
+)
+from estimation.output import Estimate
+from estimation.state import NOMINAL_SIZE
+from logs.estimates import landing_series
+from logs.topics import definition_text
+
+HORIZON = np.arange(0.0, 6.0, 0.1)
+
+
+def estimate(
+    t_ns: int, relative: tuple[float, float, float], rate: float = 0.0, roll: float = 0.0
+) -> Estimate:
+    deck = np.array([*relative, 0.0, 0.0, 0.0, 0.0, rate])
+    return Estimate(
+        t_ns, np.array(relative), np.zeros(3), euler_to_quat(roll, 0.0, 0.3), 0.01 * np.eye(9),
+        np.zeros(NOMINAL_SIZE), np.ones(36), deck, 1e-4 * np.eye(8),
+    )  # fmt: skip
+
+
+def forecast(t_ns: int, rate: float, skill: float = 0.8) -> DeckForecast:
+    ones = np.ones(len(HORIZON))
+    return DeckForecast(
+        t_ns, HORIZON, 0 * ones, 0.1 * ones, rate * ones, 0.05 * ones, skill * ones, 0.4, True
+    )
+
+
+def fly(p: Progress, seconds: float, seen: Situation, c: LandingConfig) -> tuple[Progress, Decision]:
+    """Let a situation last, at 20 Hz."""
+    for _ in range(max(1, round(20 * seconds))):
+        now = seen.now_ns + 50_000_000
+        e = None if seen.estimate is None else replace(seen.estimate, t_ns=now)
+        seen = replace(seen, now_ns=now, estimate=e)
+        p, decision = step(p, seen, c)
+    return p, decision
+
+
+def test_the_seeds_example_is_searched_from_42_m() -> None:
+    c = LandingConfig(
+        anchor_radius_m=15.0, gps_horizontal_error_m=2.0, gps_vertical_error_m=5.0,
+        field_of_view_rad=math.radians(50.0),
+    )  # fmt: skip
+    assert search_altitude_m(c) == 42.0
+    assert search_altitude_m(replace_field(c, search_altitude_m=20.5)) == 20.5
+
+
+def replace_field(c: LandingConfig, **changed: float) -> LandingConfig:
+    return LandingConfig(**{f: changed.get(f, getattr(c, f)) for f in c.__struct_fields__})
+
+
+def test_a_landing_goes_through_all_modes_in_order() -> None:
+    c = LandingConfig()
+    high = search_altitude_m(c)
+    p, said = step(Progress(), Situation(0, None), c)
+    assert said.mode is Mode.IDLE
+    p, said = fly(p, 0.1, Situation(0, estimate(0, (8.0, -6.0, -high))), c)
+    assert (said.mode, said.reason) == (Mode.SEARCH, Reason.STARTED)
+    assert said.velocity_mps == pytest.approx([-3.2, 2.4, 0.0])
+    p, said = fly(p, 1.0, Situation(p.since_ns, estimate(0, (1.0, 0.0, -high)), 0.1), c)
+    assert (said.mode, said.reason) == (Mode.TRACKING, Reason.TARGET_FOUND)
+    assert said.velocity_mps[2] > 0.5
+    low = c.track_share * high
+    p, said = fly(p, 1.2, Situation(p.since_ns, estimate(0, (0.1, 0.0, -low)), 0.1), c)
+    assert (said.mode, said.reason) == (Mode.OBSERVATION, Reason.ALIGNED)
+    moving = Situation(p.since_ns, estimate(0, (0.1, 0.0, -low), 0.4), 0.1, forecast(0, 0.4))
+    p, said = fly(p, c.observe_s - 1.0, moving, c)
+    assert said.mode is Mode.OBSERVATION
+    p, said = fly(p, 1.5, replace(moving, now_ns=p.since_ns + round((c.observe_s - 1.0) * 1e9)), c)
+    assert (said.mode, said.reason) == (Mode.LANDING, Reason.FORECAST_SKILFUL)
+    assert said.velocity_mps[2] == pytest.approx(0.5 - 0.4)
+    hold = Situation(p.since_ns, estimate(0, (0.05, 0.0, -c.hold_height_m), 0.4), 0.1, forecast(0, 0.6))
+    p, said = fly(p, 1.0, hold, c)
+    assert p.descent_ns is None
+    p, said = fly(p, 0.05, replace(hold, now_ns=p.since_ns + 10**9, forecast=forecast(0, 0.1)), c)
+    assert (said.mode, said.reason) == (Mode.LANDING, Reason.DECK_QUIET)
+    assert said.velocity_mps[2] == pytest.approx(c.touchdown_rate_mps - 0.1)
+    p, said = fly(p, 0.05, replace(hold, now_ns=(p.descent_ns or 0) + 10**9, on_deck=True), c)
+    assert (said.mode, said.reason) == (Mode.LANDED, Reason.CONTACT)
+
+
+def landing(descending: bool = True) -> Progress:
+    return Progress(Mode.LANDING, Reason.DECK_QUIET, descent_ns=0 if descending else None)
+
+
+@pytest.mark.parametrize(
+    ("seen", "reason"),
+    [
+        (Situation(10**9, estimate(10**9, (0.0, 0.0, -0.7)), 1.5), Reason.TARGET_LOST),
+        (Situation(10**9, estimate(10**9, (0.6, 0.0, -0.3)), 0.1), Reason.OUTSIDE_R_LAND),
+        (Situation(10**9, estimate(10**9, (0.0, 0.0, -0.3), roll=0.4), 0.1), Reason.TILTED),
+        (Situation(60 * 10**9, estimate(60 * 10**9, (0.0, 0.0, -0.3)), 0.1), Reason.NO_CONTACT),
+        (Situation(10**9, estimate(5 * 10**8, (0.0, 0.0, -0.3)), 0.1), Reason.ESTIMATE_STALE),
+        (Situation(10**9, estimate(10**9, (math.nan, 0.0, -0.3)), 0.1), Reason.ESTIMATE_UNSURE),
+    ],
+)
+def test_a_descent_is_broken_off_when_it_must_be(seen: Situation, reason: Reason) -> None:
+    p, said = step(landing(), seen, LandingConfig())
+    assert (said.mode, said.reason) == (Mode.ABORT, reason)
+    assert said.velocity_mps[2] == -LandingConfig().climb_mps
+    assert p.attempts == 1
+
+
+def test_below_the_blind_height_the_target_need_not_be_in_view() -> None:
+    seen = Situation(10**9, estimate(10**9, (0.0, 0.0, -0.3)), 1.5)
+    assert step(landing(), seen, LandingConfig())[1].mode is Mode.LANDING
+
+
+def test_a_lost_target_is_searched_for_again() -> None:
+    c = LandingConfig()
+    for mode in (Mode.TRACKING, Mode.OBSERVATION):
+        seen = Situation(10**9, estimate(10**9, (0.0, 0.0, -7.0)), 1.5)
+        assert step(Progress(mode), seen, c)[1].mode is Mode.SEARCH
+    p = Progress(Mode.ABORT, Reason.TARGET_LOST, attempts=1)
+    low = Situation(10**9, estimate(10**9, (0.0, 0.0, -1.0)), 1.5)
+    assert step(p, low, c)[1].mode is Mode.ABORT
+    clear = replace(low, estimate=estimate(10**9, (0.0, 0.0, -search_altitude_m(c))))
+    assert step(p, clear, c)[1].reason is Reason.TRY_AGAIN
+    tired = replace(p, attempts=c.attempts)
+    assert step(tired, clear, c)[1].reason is Reason.GIVEN_UP
+
+
+def test_a_calm_deck_needs_no_forecast_and_a_wild_one_is_landed_on_in_the_end() -> None:
+    c = LandingConfig()
+    for rate, reason in ((0.05, Reason.DECK_CALM), (0.8, Reason.OBSERVED_LONG_ENOUGH)):
+        seen = Situation(0, estimate(0, (0.0, 0.0, -7.0), rate), 0.1, forecast(0, rate, skill=0.1))
+        _, said = fly(Progress(Mode.OBSERVATION), c.observe_max_s + 0.1, seen, c)
+        assert (said.mode, said.reason) == (Mode.LANDING, reason)
+
+
+def test_every_reason_is_explained_and_every_mode_is_in_the_message() -> None:
+    assert set(EXPLANATIONS) == set(Reason)
+    text = definition_text("deckfix_msgs/msg/LandingMode")
+    for mode in Mode:
+        assert f"uint8 {mode.name}={mode.value}\n" in text
+
+
+def test_decisions_become_messages_a_series_for_each_reason() -> None:
+    c = LandingConfig()
+    said = [
+        step(landing(), Situation(10**9, estimate(10**9, (0.0, 0.0, -0.7)), age), c)[1]
+        for age in (0.1, 0.1, 1.5)
+    ]
+    times = np.array([1, 2, 3], dtype=np.int64)
+    quiet, lost = landing_series(times, times + 5, said)
+    assert (quiet.strings["reason"], lost.strings["reason"]) == ("deck_quiet", "target_lost")
+    assert quiet.stamp_ns.tolist() == [1, 2]
+    assert lost.data["mode"].tolist() == [int(Mode.ABORT)]
+    assert lost.data["velocity"][0].tolist() == [0.0, 0.0, -c.climb_mps]
+    assert quiet.data["inside_probability"][0] > 0.99
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "r_land_m = 2.0",
+        "touchdown_rate_mps = 0.6",
+        "observe_s = 100.0",
+        "approach_rate_mps = 0.7",
+        "search_altitude_m = -3.0",
+    ],
+)
+def test_a_table_that_contradicts_itself_or_the_seed_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError):
+        parse_config(f"[landing]\n{text}\n")
+    assert Config().landing == LandingConfig()
