@@ -105,7 +105,8 @@ def _one(
         rotation = quat_to_matrix(euler_to_quat(*(math.radians(a) for a in attitude))) @ R_CB_NOMINAL.T
     image = np.ascontiguousarray(image)
     try:
-        result = TargetDetector(camera, target, method=method).detect(image, rotation)
+        # A few pictures do not repay loading the compiled code.
+        result = TargetDetector(camera, target, method=method, engine="numpy").detect(image, rotation)
     except ValueError as error:
         raise InputError(f"{name}: {error}") from error
     picture = draw_overlay(camera, target, image, result) if drawn else None

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 def cache_home() -> Path:
@@ -30,3 +32,31 @@ def writable(folder: Path) -> bool:
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     return os.access(folder, os.W_OK)
+
+
+def jitted(function: Callable[..., Any], sources: Iterable[Path]) -> Callable[..., Any]:
+    """Return ``function`` compiled by numba at its first call, and kept where ``cache_of`` its sources says."""
+    import numba
+
+    folder = cache_of(sources)
+    compiled: Callable[..., Any]
+    if folder is None:
+        compiled = numba.njit(error_model="numpy")(function)
+        return compiled
+    with _cached_in(folder):
+        compiled = numba.njit(cache=True, error_model="numpy")(function)
+    return compiled
+
+
+@contextmanager
+def _cached_in(folder: Path) -> Iterator[None]:
+    """Let numba cache what is defined within in a folder; it reads its setting when a function is decorated."""
+    import numba
+
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder)
+    try:
+        yield
+    finally:
+        settings.CACHE_DIR = before

@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numba
 import numpy as np
 from numba.extending import overload, register_jitable
 
 from estimation import deck, frames, models, parameters, state, update
 from estimation import rows as rows_module
-from estimation.codecache import cache_of
+from estimation.codecache import jitted
 from estimation.deck import deck_output, seen_height
 from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
@@ -60,18 +57,6 @@ _FUSED_LATE = int(Outcome.FUSED_LATE)
 _DOWNWEIGHTED = int(Outcome.DOWNWEIGHTED)
 _REJECTED_GATE = int(Outcome.REJECTED_GATE)
 _IMU = 0
-
-
-@contextmanager
-def _cached_in(folder: Path) -> Iterator[None]:
-    """Let numba cache what is defined within in a folder; it reads its setting when a function is decorated."""
-    settings: Any = numba.config
-    before = settings.CACHE_DIR
-    settings.CACHE_DIR = str(folder)
-    try:
-        yield
-    finally:
-        settings.CACHE_DIR = before
 
 
 @overload(frames.compose)
@@ -418,19 +403,8 @@ def _advance(
     return count
 
 
-def _jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    modules = (deck, frames, models, parameters, rows_module, state, update)
-    folder = cache_of([Path(inspect.getfile(m)) for m in modules] + [Path(__file__)])
-    compiled: Callable[..., Any]
-    if folder is None:
-        compiled = numba.njit(error_model="numpy")(function)
-        return compiled
-    with _cached_in(folder):
-        compiled = numba.njit(cache=True, error_model="numpy")(function)
-    return compiled
-
-
-_kernel = _jit(_advance)
+_SOURCES = (deck, frames, models, parameters, rows_module, state, update)
+_kernel = jitted(_advance, [Path(inspect.getfile(m)) for m in _SOURCES] + [Path(__file__)])
 
 
 @dataclass(slots=True)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from vision.lines import edge_sides
 from vision.plane import LevelPlane, rotation_xy
-from vision.refine import INV_SQRT_2PI, Fit, phi
+from vision.profile import INV_SQRT_2PI, phi
+from vision.refine import Fit
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

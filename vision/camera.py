@@ -121,6 +121,11 @@ class Camera:
         """Vertical field of view [rad] of the pinhole, without distortion."""
         return 2.0 * math.atan(self.height / 2.0 / self.fy)
 
+    @cached_property
+    def lens(self) -> Array:
+        """Lens coefficients k1, k2, p1, p2, k3, k4, k5, k6, shape (8,), those that are not given zero."""
+        return np.array(self.distortion + (0.0,) * (8 - len(self.distortion)))
+
     @property
     def matrix(self) -> Array:
         """The camera matrix K of seed (2.22), shape (3, 3)."""
@@ -142,7 +147,7 @@ class Camera:
             x, y = np.broadcast_arrays(x, y)
             return x.copy(), y.copy()
         x, y = np.broadcast_arrays(x, y)
-        return undistort(x, y, self.distortion)
+        return undistort(x, y, self.lens)
 
     def project(self, points_m: ArrayLike) -> tuple[Array, Array]:
         """Return the pixel (u, v) of points in the camera frame, shape (..., 3); NaN behind the camera (Z <=
@@ -154,7 +159,7 @@ class Camera:
         z = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
         x, y = p[..., 0] / z, p[..., 1] / z
         if self.distortion:
-            x, y = distort(x, y, self.distortion)
+            x, y = distort(x, y, self.lens)
         return self.fx * x + self.centre[0], self.fy * y + self.centre[1]
 
     @cached_property

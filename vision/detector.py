@@ -13,9 +13,10 @@ from estimation.frames import R_CB_NOMINAL, skew
 from vision.area import fit_area
 from vision.camera import Camera, check_rotation
 from vision.ellipse import plane_rotations
+from vision.engine import engine_of
 from vision.fix import NoFix, VisionFix
 from vision.judge import beyond_doubt, clearly_better, doubtful, judge_area, judge_profiles, rank
-from vision.lines import Edges
+from vision.lines import edges_of, usable_edges
 from vision.plane import LevelPlane, rotation_to_level, rotation_vector_xy, rotation_xy
 from vision.redness import ratio_table, red_mask
 from vision.refine import Fit, fit_profiles
@@ -79,6 +80,10 @@ class TargetDetector:
         Body to camera, shape (3, 3); used only to turn ``body_rate_radps`` for rolling shutters.
     min_share
         Least share of the visible edge length that has to agree with the model.
+    engine
+        ``"compiled"`` (needs numba), ``"numpy"``, or ``"auto"``: compiled where numba is installed. The fixes
+        are the same; compiled, they take a fraction of the time, but the very first detector on a machine
+        waits about a minute for the compiler (the result is kept in the user's cache folder).
 
     Raises ``ValueError`` naming the argument.
     """
@@ -96,6 +101,7 @@ class TargetDetector:
         model_error_px: float = 0.003,
         R_cb: ArrayLike = R_CB_NOMINAL,
         min_share: float = 0.55,
+        engine: str = "auto",
     ) -> None:
         if not isinstance(camera, Camera):
             raise ValueError(f"camera: a {type(camera).__name__}, not a vision.Camera")
@@ -114,8 +120,9 @@ class TargetDetector:
         self.min_share = _sigma("min_share", min_share, 1.0)
         self._R_cb = check_rotation(R_cb, "R_cb")
         self._edges = np.asarray(target.edges_m, dtype=np.float64)
-        self._edge_table = Edges.of(self._edges)
+        self._edge_table = edges_of(self._edges)
         self._margin_m = 0.5 * target.side_m - self._edges[0]
+        self._engine = engine_of(engine)
         self._tables = tuple(ratio_table(ratio) for ratio in (1.3, 1.8, 1.12))
 
     def detect(
@@ -243,7 +250,10 @@ class TargetDetector:
         level = np.zeros(2)
         if rotation is not None:
             plane = LevelPlane(self.camera, rotation, rate)
-            yield [_Candidate(h, plane, level) for h in identify_circles(contours, plane, self._edges)]
+            yield [
+                _Candidate(h, plane, level)
+                for h in identify_circles(contours, plane.view, self._edges, self._engine.label)
+            ]
             yield [_Candidate(h, plane, level) for h in identify_votes(contours, plane, self._edges)]
         candidates: list[_Candidate] = []
         for plane in self._ellipse_planes(contours, rate):
@@ -255,7 +265,10 @@ class TargetDetector:
                 if np.hypot(*tilt) > MAX_DECK_TILT_RAD:
                     continue
                 plane = LevelPlane(self.camera, turn @ rotation, rate)
-            candidates += [_Candidate(h, plane, tilt) for h in identify_circles(contours, plane, self._edges)]
+            candidates += [
+                _Candidate(h, plane, tilt)
+                for h in identify_circles(contours, plane.view, self._edges, self._engine.label)
+            ]
         yield sorted(candidates, key=lambda c: -c.hypothesis.score)
 
     def _ellipse_planes(self, contours: Contours, rate: Array | None) -> Iterator[LevelPlane]:
@@ -280,7 +293,7 @@ class TargetDetector:
         plane, hypothesis = candidate.plane, candidate.hypothesis
         unit = float(plane.units_per_pixel(hypothesis.centre[0], hypothesis.centre[1]))
         to_px = hypothesis.kappa / unit
-        usable = self._edge_table.usable(to_px)
+        usable = usable_edges(self._edge_table, to_px, 0.0)
         sigma = (
             FREE_TILT_SIGMA_RAD
             if free
@@ -301,6 +314,7 @@ class TargetDetector:
                 self._edge_table,
                 tilt_sigma_rad=tilt_sigma_rad,
                 tilt=candidate.tilt,
+                solver=self._engine.solve,
             )
 
         fit = fit_with(sigma or (AUTO_TILT_SIGMA_RAD if candidate.tilt.any() else 0.0))

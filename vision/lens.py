@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
 
-def _coefficients(distortion: tuple[float, ...]) -> tuple[float, ...]:
-    """Return (k1, k2, p1, p2, k3, k4, k5, k6), missing ones zero."""
-    return distortion + (0.0,) * (8 - len(distortion))
+def distort(x: Any, y: Any, lens: Array) -> tuple[Any, Any]:
+    """Return where the lens puts rays (x, y), floats or arrays: OpenCV's radial, tangential and rational
+    model.
 
-
-def distort(x: Array, y: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Return where the lens puts rays (x, y): OpenCV's radial, tangential and rational model, of 4, 5 or 8
-    terms.
+    ``lens`` (8,) is k1, k2, p1, p2, k3, k4, k5, k6.
     """
-    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(distortion)
     s = x * x + y * y
-    radial = (1.0 + s * (k1 + s * (k2 + s * k3))) / (1.0 + s * (k4 + s * (k5 + s * k6)))
+    radial = (1.0 + s * (lens[0] + s * (lens[1] + s * lens[4]))) / (
+        1.0 + s * (lens[5] + s * (lens[6] + s * lens[7]))
+    )
     return (
-        x * radial + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
-        y * radial + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y,
+        x * radial + 2.0 * lens[2] * x * y + lens[3] * (s + 2.0 * x * x),
+        y * radial + lens[2] * (s + 2.0 * y * y) + 2.0 * lens[3] * x * y,
     )
 
 
-def undistort(xd: Array, yd: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
+def undistort(xd: Array, yd: Array, lens: Array) -> tuple[Array, Array]:
     """Invert the lens model by Newton's method; NaN where it does not converge (no ray has that image)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(distortion)
+    k1, k2, p1, p2, k3, k4, k5, k6 = lens
     x, y = xd.astype(np.float64), yd.astype(np.float64)
     with np.errstate(all="ignore"):
         for _ in range(25):
@@ -38,7 +38,7 @@ def undistort(xd: Array, yd: Array, distortion: tuple[float, ...]) -> tuple[Arra
             slope = (
                 k1 + s * (2.0 * k2 + s * 3.0 * k3) - radial * (k4 + s * (2.0 * k5 + s * 3.0 * k6))
             ) / under
-            ex, ey = distort(x, y, distortion)
+            ex, ey = distort(x, y, lens)
             ex, ey = ex - xd, ey - yd
             a = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
             b = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
@@ -47,6 +47,6 @@ def undistort(xd: Array, yd: Array, distortion: tuple[float, ...]) -> tuple[Arra
             x, y = x - (d * ex - b * ey) / det, y - (a * ey - b * ex) / det
             if np.nanmax(np.abs(ex) + np.abs(ey), initial=0.0) < 1e-13:
                 break
-        ex, ey = distort(x, y, distortion)
+        ex, ey = distort(x, y, lens)
         bad = ~(np.abs(ex - xd) + np.abs(ey - yd) < 1e-9)
     return np.where(bad, np.nan, x), np.where(bad, np.nan, y)

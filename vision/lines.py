@@ -8,14 +8,23 @@ parameters.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.plane import LevelPlane
+from vision.view import (
+    View,
+    inside,
+    pixel_rays,
+    plane_gradient,
+    rays_to_plane,
+    to_pixels,
+    units_per_pixel,
+)
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 Image = NDArray[np.uint8]
 
 SAMPLES = 7
@@ -25,12 +34,12 @@ MIN_GAP_PX = 3.5
 MIN_RADIUS_PX = 3.5
 HALF_LENGTH_PX = 3.2
 MIN_HALF_LENGTH_PX = 2.6
+MIN_LINES = 12
+STEP = 0.002
+"""Size of the second circle that shows the direction of the radius, relative to the outermost edge."""
 
-_ALONG = np.linspace(-1.0, 1.0, SAMPLES)
 
-
-@dataclass(frozen=True, slots=True)
-class Edges:
+class Edges(NamedTuple):
     """A target's edges, all (k,): radius [m], side (+1 outside of red, -1 edge of a hole), and the
     distances to the nearer and to the farther neighbour [m]."""
 
@@ -39,23 +48,15 @@ class Edges:
     near_m: Array
     far_m: Array
 
-    @classmethod
-    def of(cls, radii_m: Array) -> Edges:
-        """Return the edges of radii that descend from the outside in."""
-        steps = -np.diff(radii_m)
-        outward = np.concatenate(([np.inf], steps))
-        inward = np.concatenate((steps, [2.0 * radii_m[-1]]))
-        near, far = np.minimum(outward, inward), np.maximum(outward, inward)
-        return cls(radii_m, edge_sides(len(radii_m)), near, far)
 
-    def usable(self, to_px: float, blur_px: float = 0.0) -> NDArray[np.bool_]:
-        """Return which edges can be measured one by one, at ``to_px`` pixels per metre and with such a
-        blur."""
-        near, far = self.near_m * to_px, self.far_m * to_px
-        apart: NDArray[np.bool_] = (near > MIN_GAP_PX) | (
-            (near > 0.7 * MIN_GAP_PX) & (far > 1.4 * MIN_GAP_PX)
-        )
-        return apart & (self.radius_m * to_px > max(MIN_RADIUS_PX, 3.0 * blur_px))
+def edges_of(radii_m: Array) -> Edges:
+    """Return the edges of radii that descend from the outside in."""
+    steps = -np.diff(radii_m)
+    outward = np.concatenate(([np.inf], steps))
+    inward = np.concatenate((steps, [2.0 * radii_m[-1]]))
+    return Edges(
+        np.array(radii_m), edge_sides(len(radii_m)), np.minimum(outward, inward), np.maximum(outward, inward)
+    )
 
 
 def edge_sides(n_edges: int) -> Array:
@@ -63,162 +64,195 @@ def edge_sides(n_edges: int) -> Array:
     return np.where(np.arange(n_edges) % 2 == 0, 1.0, -1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Lines:
+def usable_edges(edges: Edges, to_px: float, blur_px: float) -> NDArray[np.bool_]:
+    """Return which edges can be measured one by one, at ``to_px`` pixels per metre and with such a blur."""
+    near, far = edges.near_m * to_px, edges.far_m * to_px
+    apart = (near > MIN_GAP_PX) | ((near > 0.7 * MIN_GAP_PX) & (far > 1.4 * MIN_GAP_PX))
+    usable: NDArray[np.bool_] = apart & (edges.radius_m * to_px > max(MIN_RADIUS_PX, 3.0 * blur_px))
+    return usable
+
+
+class Lines(NamedTuple):
     """Lines of pixels across edges, p lines of m pixels.
 
-    ``distance`` (p, m) of each pixel outward from the edge as predicted [px], ``value`` (p, m) its
-    brightness less the line's mean, ``red`` (p, m) its R, ``weight`` (p, m) zero for repeated and missing
-    pixels, ``total`` (p,) their sum. (p,): ``edge`` index, ``side``, ``level`` mean brightness, ``half_px``
-    length, ``bend`` curvature of the edge [1/px] halved, ``gap_px`` to the nearer neighbour, ``outward_px``
-    and ``inward_px`` to the neighbours (infinite where there is none) and their ``_bend``, place ``u0``,
-    ``v0``, image normal ``nu``, ``nv``. ``design`` (p, 6): change of the displacement with the centre x, y,
-    kappa, tilt x, y and the growth of red [px]; ``considered`` (p, 3): with the relative focal length and
+    ``pixels`` (p, m, 4): DISTANCE of each pixel outward from the edge as predicted [px], its VALUE
+    (brightness), its RED, and its WEIGHT, zero for repeated and missing pixels. ``edge`` (p,) the edge's index.
+    ``row`` (p, 23): the columns named below; DESIGN begins the change of the edge's displacement with the
+    centre x, y, kappa, tilt x, y and the growth of red [px], CONSIDERED that with the relative focal length and
     the principal point [px].
     """
 
-    distance: Array
-    value: Array
-    red: Array
-    weight: Array
-    total: Array
-    edge: NDArray[np.intp]
-    side: Array
-    level: Array
-    half_px: Array
-    bend: Array
-    gap_px: Array
-    outward_px: Array
-    inward_px: Array
-    outward_bend: Array
-    inward_bend: Array
-    u0: Array
-    v0: Array
-    nu: Array
-    nv: Array
-    design: Array
-    considered: Array
+    pixels: Array
+    edge: IntArray
+    row: Array
+
+
+DISTANCE, VALUE, RED, WEIGHT = 0, 1, 2, 3
+TOTAL = 0
+"""Sum of a line's weights."""
+SIDE, LEVEL = 1, 2
+"""+1 outside of red, -1 edge of a hole; mean brightness."""
+HALF_PX, GAP_PX = 3, 4
+"""Half the line's length; distance to the nearer neighbouring edge."""
+BEND = 5
+"""Curvature of the edge [1/px], halved."""
+OUTWARD_PX, INWARD_PX, OUTWARD_BEND, INWARD_BEND = 6, 7, 8, 9
+"""Distances to the neighbouring edges (infinite where there is none) and their bend."""
+U0, V0, NU, NV = 10, 11, 12, 13
+"""Place of the edge and its normal in the image."""
+DESIGN, CONSIDERED, COLUMNS = 14, 20, 23
+
+
+def empty_lines(n: int) -> Lines:
+    """Return ``n`` lines whose content is undefined."""
+    return Lines(np.empty((n, SAMPLES, 4)), np.empty(n, dtype=np.int64), np.empty((n, COLUMNS)))
+
+
+def line_counts(
+    view: View, centre: Array, kappa: float, edges: Edges, blur_px: float, n_lines: int
+) -> tuple[IntArray, Array]:
+    """Return the edges that can be measured and how many lines each should have, both (k,)."""
+    to_px = kappa / units_per_pixel(view, centre[0], centre[1])
+    usable = np.flatnonzero(usable_edges(edges, to_px, blur_px))
+    want = np.minimum(np.maximum(2.5 * to_px * edges.radius_m[usable], 10.0), 30.0)
+    want *= min(1.0, n_lines / max(want.sum(), 1.0))
+    return usable, np.maximum(want, 6.0)
+
+
+def line_half_px(gap_px: Any, blur_px: float) -> Any:
+    """Return half the length of lines across edges with this gap to the nearer neighbour."""
+    longest = max(HALF_LENGTH_PX, 3.0 * blur_px)
+    return np.minimum(np.maximum(0.6 * gap_px, MIN_HALF_LENGTH_PX), longest)
 
 
 def lay_lines(
     image: Image,
-    plane: LevelPlane,
+    view: View,
     centre: Array,
     kappa: float,
     edges: Edges,
     blur_px: float,
     n_lines: int,
-) -> Lines | None:
-    """Lay lines of pixels across the edges that lie inside the image; None where there are too few."""
-    half_length_px = max(HALF_LENGTH_PX, 3.0 * blur_px)
-    to_px = kappa / float(plane.units_per_pixel(centre[0], centre[1]))
-    usable = np.flatnonzero(edges.usable(to_px, blur_px))
+) -> Lines:
+    """Lay lines of pixels across the edges that lie inside the image; none where there are too few."""
+    usable, want = line_counts(view, centre, kappa, edges, blur_px, n_lines)
     if not len(usable):
-        return None
-    want = np.clip((2.5 * to_px) * edges.radius_m[usable], 10.0, 30.0)
-    want *= min(1.0, n_lines / float(want.sum()))
-    edge, cos, sin, u, v = _place(plane, centre, kappa, edges, usable, np.maximum(want, 6.0))
-    inside = plane.inside(u[0], v[0], 1.5)
-    seen = float(inside.mean())
+        return empty_lines(0)
+    edge, cos, sin, u, v = _place(view, centre, kappa, edges, usable, want)
+    seen_line = inside(view, u[0], v[0], 1.5)
+    seen = float(seen_line.mean())
     if 0.0 < seen < 0.6:
-        edge, cos, sin, u, v = _place(
-            plane, centre, kappa, edges, usable, np.maximum(want, 6.0) / max(seen, 0.15)
+        edge, cos, sin, u, v = _place(view, centre, kappa, edges, usable, want / max(seen, 0.15))
+        seen_line = inside(view, u[0], v[0], 1.5)
+    if not seen_line.all():
+        edge, cos, sin, u, v = (
+            edge[seen_line],
+            cos[seen_line],
+            sin[seen_line],
+            u[:, seen_line],
+            v[:, seen_line],
         )
-        inside = plane.inside(u[0], v[0], 1.5)
-    if not inside.all():
-        edge, cos, sin, u, v = edge[inside], cos[inside], sin[inside], u[:, inside], v[:, inside]
-    if len(edge) < 12:
-        return None
+    if len(edge) < MIN_LINES:
+        return empty_lines(0)
     u0, v0 = u[0], v[0]
     du, dv = u[1] - u0, v[1] - v0
     length = np.hypot(du, dv)
     # Pixels per metre on the target along the radius: the second circle is STEP larger.
     gap = edges.near_m[edge] * (length / (STEP * edges.radius_m[0]))
-    half = np.clip(0.6 * gap, MIN_HALF_LENGTH_PX, half_length_px)
-    reach = (half / length)[:, None] * _ALONG
+    half = line_half_px(gap, blur_px)
+    reach = (half / length)[:, None] * np.linspace(-1.0, 1.0, SAMPLES)
     ui = np.rint(u0[:, None] + reach * du[:, None])
     vi = np.rint(v0[:, None] + reach * dv[:, None])
     weight = np.ones(ui.shape)
     # The same pixel twice on a line says nothing new; pixels outside the image say nothing.
     weight[:, 1:] = (np.diff(ui, axis=1) != 0.0) | (np.diff(vi, axis=1) != 0.0)
-    w, h = plane.camera.width - 1.0, plane.camera.height - 1.0
+    w, h = view.width - 1.0, view.height - 1.0
     if ui.min() < 0.0 or vi.min() < 0.0 or ui.max() > w or vi.max() > h:
         weight[(ui < 0.0) | (vi < 0.0) | (ui > w) | (vi > h)] = 0.0
         ui, vi = np.clip(ui, 0.0, w), np.clip(vi, 0.0, h)
-    pixels = image[vi.astype(np.intp), ui.astype(np.intp)].astype(np.float64)
-    value = 0.5 * (pixels[..., 0] + pixels[..., 1])
+    lines = empty_lines(len(edge))
+    pixels, row = lines.pixels, lines.row
+    colour = image[vi.astype(np.intp), ui.astype(np.intp)]
+    value = 0.5 * (colour[..., 0].astype(np.float64) + colour[..., 1])
+    pixels[:, :, VALUE], pixels[:, :, RED], pixels[:, :, WEIGHT] = value, colour[..., 2], weight
     total = weight.sum(axis=1)
-    level = (value * weight).sum(axis=1) / np.maximum(total, 1.0)
-    value -= level[:, None]
+    row[:, TOTAL] = total
+    row[:, LEVEL] = (value * weight).sum(axis=1) / np.maximum(total, 1.0)
 
-    x, y = plane.rays(ui, vi)
-    qx, qy = plane.from_rays(x, y, vi)
+    x, y = pixel_rays(view, ui, vi)
+    qx, qy = rays_to_plane(view, x, y, vi)
     rho = np.hypot(qx - centre[0], qy - centre[1])
     rk = kappa * edges.radius_m[edge]
     # The gradient of rho in the image, at the edge itself.
-    xm, ym = plane.rays(u0, v0)
+    xm, ym = pixel_rays(view, u0, v0)
     qxm, qym = centre[0] + rk * cos, centre[1] + rk * sin
-    r = plane.rotation
-    depth = r[2, 0] * xm + r[2, 1] * ym + r[2, 2]
-    tangent = cos * qxm + sin * qym
-    gx = (cos * r[0, 0] + sin * r[1, 0] - tangent * r[2, 0]) / depth
-    gy = (cos * r[0, 1] + sin * r[1, 1] - tangent * r[2, 1]) / depth
-    gu, gv = gx / plane.camera.fx, gy / plane.camera.fy
+    gu, gv = plane_gradient(view, cos, sin, qxm, qym, xm, ym)
     slope = np.hypot(gu, gv)
     per = 1.0 / slope
     side = edges.side[edge]
-    design = np.empty((len(edge), 6))
-    design[:, 0] = cos * per
-    design[:, 1] = sin * per
-    design[:, 2] = edges.radius_m[edge] * per
-    design[:, 3] = (cos * qxm * qym + sin * (1.0 + qym * qym)) * per
-    design[:, 4] = -(cos * (1.0 + qxm * qxm) + sin * qxm * qym) * per
-    design[:, 5] = side
-    considered = np.empty((len(edge), 3))
-    considered[:, 0] = (gx * xm + gy * ym) * per
-    considered[:, 1] = gu * per
-    considered[:, 2] = gv * per
-    radii = np.concatenate(([np.inf], edges.radius_m, [-np.inf]))
+    pixels[:, :, DISTANCE] = (rho - rk[:, None]) * per[:, None]
+    lines.edge[:] = edge
+    for k, column in enumerate(line_design(cos, sin, qxm, qym, edges.radius_m[edge], per, side)):
+        row[:, DESIGN + k] = column
+    for k, column in enumerate(line_considered(view, gu, gv, xm, ym, per)):
+        row[:, CONSIDERED + k] = column
+    outward, inward = neighbours(edges)
     scale = kappa * per
-    return Lines(
-        (rho - rk[:, None]) * per[:, None],
-        value,
-        pixels[..., 2],
-        weight,
-        total,
-        edge,
+    row[:, SIDE], row[:, HALF_PX], row[:, GAP_PX] = side, half, gap
+    row[:, BEND] = 0.5 * slope / rk
+    row[:, OUTWARD_PX] = (outward[edge] - edges.radius_m[edge]) * scale
+    row[:, INWARD_PX] = (edges.radius_m[edge] - inward[edge]) * scale
+    row[:, OUTWARD_BEND] = 0.5 / (outward[edge] * scale)
+    row[:, INWARD_BEND] = 0.5 / (np.maximum(inward[edge], 0.1 * edges.radius_m[-1]) * scale)
+    row[:, U0], row[:, V0] = u0, v0
+    row[:, NU], row[:, NV] = row[:, CONSIDERED + 1], row[:, CONSIDERED + 2]
+    return lines
+
+
+def neighbours(edges: Edges) -> tuple[Array, Array]:
+    """Return the radii of the next edge outwards (infinite for the outermost) and inwards (minus infinity),
+    (k,).
+    """
+    outward, inward = np.full_like(edges.radius_m, np.inf), np.full_like(edges.radius_m, -np.inf)
+    outward[1:] = edges.radius_m[:-1]
+    inward[:-1] = edges.radius_m[1:]
+    return outward, inward
+
+
+def line_design(cos: Any, sin: Any, qx: Any, qy: Any, radius_m: Any, per: Any, side: Any) -> tuple[Any, ...]:
+    """Return the columns of ``Lines.design`` for edge points (qx, qy) in the direction (cos, sin); ``per`` is
+    in pixels per unit of the plane.
+    """
+    return (
+        cos * per,
+        sin * per,
+        radius_m * per,
+        (cos * qx * qy + sin * (1.0 + qy * qy)) * per,
+        -(cos * (1.0 + qx * qx) + sin * qx * qy) * per,
         side,
-        level,
-        half,
-        0.5 * slope / rk,
-        gap,
-        (radii[edge] - radii[edge + 1]) * scale,
-        (radii[edge + 1] - radii[edge + 2]) * scale,
-        0.5 / (radii[edge] * scale),
-        0.5 / (np.maximum(radii[edge + 2], 0.1 * edges.radius_m[-1]) * scale),
-        u0,
-        v0,
-        considered[:, 1],
-        considered[:, 2],
-        design,
-        considered,
     )
 
 
-STEP = 0.002
-"""Size of the second circle that shows the direction of the radius, relative to the outermost edge."""
+def line_considered(view: View, gu: Any, gv: Any, x: Any, y: Any, per: Any) -> tuple[Any, Any, Any]:
+    """Return the columns of ``Lines.considered`` from the gradient of rho (gu, gv) and the rays (x, y)."""
+    return (gu * view.fx * x + gv * view.fy * y) * per, gu * per, gv * per
 
 
 def _place(
-    plane: LevelPlane, centre: Array, kappa: float, edges: Edges, usable: NDArray[np.intp], want: Array
-) -> tuple[NDArray[np.intp], Array, Array, Array, Array]:
+    view: View, centre: Array, kappa: float, edges: Edges, usable: IntArray, want: Array
+) -> tuple[IntArray, Array, Array, Array, Array]:
     """Return edge, direction and, for the edge and a slightly larger circle, pixel coordinates (2, p)."""
-    count = want.astype(np.intp)
+    count = want.astype(np.int64)
     edge = np.repeat(usable, count)
     first = np.repeat(np.cumsum(count) - count, count)
-    angle = (np.arange(len(edge)) - first + 0.37 * edge) * np.repeat(2.0 * np.pi / count, count)
+    angle = line_angle(np.arange(len(edge)) - first, np.repeat(count, count), edge)
     cos, sin = np.cos(angle), np.sin(angle)
     radius = kappa * edges.radius_m[edge]
     both = np.stack((radius, radius + STEP * kappa * edges.radius_m[0]))
-    u, v = plane.to_pixels(centre[0] + both * cos, centre[1] + both * sin)
+    u, v = to_pixels(view, centre[0] + both * cos, centre[1] + both * sin)
     return edge, cos, sin, u, v
+
+
+def line_angle(index: Any, count: Any, edge: Any) -> Any:
+    """Return the direction of the ``index``-th of ``count`` lines across an edge [rad]; edges are staggered."""
+    return (index + 0.37 * edge) * (2.0 * np.pi / count)

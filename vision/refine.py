@@ -18,13 +18,31 @@ does it on all pixels of a target so small that its edges run into each other.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.lines import Edges, Lines, lay_lines
+from vision.lines import (
+    CONSIDERED,
+    DESIGN,
+    LEVEL,
+    MIN_LINES,
+    RED,
+    U0,
+    V0,
+    VALUE,
+    WEIGHT,
+    Edges,
+    Lines,
+    lay_lines,
+)
 from vision.plane import LevelPlane, rotation_xy
+from vision.profile import crowded, line_blurs, line_moments, measure, updated_blur
+from vision.robust import Solved, least_squares, median, normal_equations, times
+from vision.view import View, turned
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -34,8 +52,8 @@ GROWTH_SIGMA_PX = 0.3
 START_BLUR_PX = 0.65
 CLOSE_PX = 0.12
 """Displacements below this are linear enough to need no second step."""
-_SQRT_2_OVER_PI = 0.7978845608028654
-INV_SQRT_2PI = 0.3989422804014327
+N_LINES = 54
+"""About how many lines are laid over all edges."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +61,7 @@ class Fit:
     """The result of a photometric fit.
 
     ``plane`` is the plane that was fitted, tilted where the tilt was free; ``centre`` (2,), ``kappa`` [1/m];
-    ``tilt`` (2,) rotation vector about the level x and y axes [rad]; ``information_inverse`` the covariance
+    ``tilt`` (2,) rotation vector about the level x and y axes [rad]; ``covariance`` that
     of (centre x, y, kappa, tilt x, y), shape (5, 5), zero rows for a fixed tilt; ``considered`` (5, 3) the
     change of those per relative error of the focal length and per pixel of the principal point;
     ``residual_px`` the root-mean-square displacement of the edges; ``share`` of the visible edge length
@@ -77,15 +95,33 @@ class Fit:
     is_area: bool = False
 
 
-def phi(t: Array) -> Array:
-    """Return the normal distribution function, to 3e-4 (Page's formula with tanh)."""
-    return 0.5 + 0.5 * np.tanh(_SQRT_2_OVER_PI * t * (1.0 + 0.044715 * t * t))
+class Solution(NamedTuple):
+    """What ``solve_profiles`` found; names as in ``Fit``, with the plane's ``rotation`` and ``seen`` (k,) for
+    each edge. Undefined where it is not ``ok``.
+    """
+
+    ok: bool
+    rotation: Array
+    centre: Array
+    kappa: float
+    tilt: Array
+    covariance: Array
+    considered: Array
+    residual_px: float
+    share: float
+    seen: NDArray[np.bool_]
+    blur_px: float
+    growth_px: float
+    chi2: float
+    n_inlier: int
+    n_visible: int
+    points_px: Array
+    agrees: NDArray[np.bool_]
+    red_slope: float
+    contradicted: float
 
 
-def _median(values: Array) -> float:
-    """Return the upper median: ``numpy.median`` takes five times as long on a hundred values."""
-    k = len(values) // 2
-    return float(np.partition(values, k)[k])
+Solver = Callable[[Image, View, Array, float, Array, Edges, float, int], Solution]
 
 
 def fit_profiles(
@@ -97,307 +133,235 @@ def fit_profiles(
     *,
     tilt_sigma_rad: float = 0.0,
     tilt: Array | None = None,
-    n_lines: int = 54,
+    n_lines: int = N_LINES,
+    solver: Solver | None = None,
 ) -> Fit | None:
     """Fit centre, scale, blur and growth (and the plane's tilt, with a prior of ``tilt_sigma_rad``, if not
     zero).
 
     ``image`` BGR; ``centre`` (2,), ``kappa`` [1/m] the start, good to about 1.5 px at the edges. None where
     too few edges are in view or the fit leaves the start. ``tilt`` (2,) is the tilt that ``plane`` already
-    has.
+    has. ``solver`` is ``solve_profiles`` or its compiled form.
     """
-    state = _State(plane, centre, kappa, np.zeros(2) if tilt is None else tilt, START_BLUR_PX, 0.0)
-    free = [0, 1, 2, 5] if tilt_sigma_rad == 0.0 else [0, 1, 2, 3, 4, 5]
-    laid_blur = START_BLUR_PX
-    lines: Lines | None = None
-    solved: _Solved | None = None
+    solve = solve_profiles if solver is None else solver
+    start = np.zeros(2) if tilt is None else tilt
+    s = solve(image, plane.view, centre, float(kappa), start, edges, float(tilt_sigma_rad), n_lines)
+    if not s.ok:
+        return None
+    return Fit(
+        LevelPlane(plane.camera, s.rotation, plane.rate_cam_radps),
+        s.centre,
+        s.kappa,
+        s.tilt,
+        s.covariance,
+        s.considered,
+        s.residual_px,
+        s.share,
+        tuple(np.flatnonzero(s.seen).tolist()),
+        s.blur_px,
+        s.growth_px,
+        s.chi2,
+        s.n_inlier,
+        s.n_visible,
+        tilt_sigma_rad > 0.0,
+        s.points_px,
+        s.agrees,
+        s.red_slope,
+        s.contradicted,
+    )
+
+
+def solve_profiles(
+    image: Image,
+    view: View,
+    centre: Array,
+    kappa: float,
+    tilt: Array,
+    edges: Edges,
+    tilt_sigma_rad: float,
+    n_lines: int,
+) -> Solution:
+    """Do the work of ``fit_profiles`` on plain arrays."""
+    free = np.array([0, 1, 2, 5]) if tilt_sigma_rad == 0.0 else np.arange(6)
     # A tilt of degrees is far from linear, a move of the centre by a pixel a little.
     near_enough_px = 0.35 if tilt_sigma_rad == 0.0 else 0.04
-    for _ in range(8):
-        lines = lay_lines(image, state.plane, state.centre, state.kappa, edges, laid_blur, n_lines)
-        if lines is None:
-            return None
-        solved = _fit_lines(state, lines, free, tilt_sigma_rad)
-        if solved is None:
-            return None
-        state.move(solved.moved)
-        if not (state.kappa > 0.0 and np.isfinite(state.centre).all()):
-            return None
-        if solved.moved_px < near_enough_px and max(state.blur_px, 1.1) < 1.25 * max(laid_blur, 1.1):
+    blur_px, growth_px = START_BLUR_PX, 0.0
+    blur_xy = np.array([blur_px * blur_px, 0.0, blur_px * blur_px])
+    laid_blur = blur_px
+    for attempt in range(8):
+        lines = lay_lines(image, view, centre, kappa, edges, laid_blur, n_lines)
+        if len(lines.edge) < MIN_LINES:
+            return _no_solution()
+        step = _fit_lines(lines, free, tilt, tilt_sigma_rad, blur_px, blur_xy, growth_px)
+        if not step.ok:
+            return _no_solution()
+        change = step.change
+        blur_px, blur_xy = step.blur_px, step.blur_xy
+        centre = centre + change[:2]
+        kappa = kappa + change[2]
+        growth_px = growth_px + change[5]
+        if tilt_sigma_rad > 0.0:
+            tilt = tilt + change[3:5]
+            view = turned(view, rotation_xy(change[3], change[4]) @ view.rotation)
+        if not (kappa > 0.0 and np.isfinite(centre).all()):
+            return _no_solution()
+        settled = step.moved_px < near_enough_px and max(blur_px, 1.1) < 1.25 * max(laid_blur, 1.1)
+        if settled or attempt == 7:
             break
-        laid_blur = state.blur_px
-    assert lines is not None and solved is not None
-    return _result(state, solved, lines, edges, free)
+        laid_blur = blur_px
+    return _result(view, centre, kappa, tilt, blur_px, growth_px, step, lines, edges, free)
 
 
-@dataclass(slots=True)
-class _State:
-    plane: LevelPlane
-    centre: Array
-    kappa: float
-    tilt: Array
-    blur_px: float
-    growth_px: float
-    blur_xy: Array | None = None
-    """The blur's covariance (uu, uv, vv) [px^2], where it differs with the direction."""
-
-    def move(self, change: Array) -> None:
-        """Apply a change of centre x, y, kappa, tilt x, y, growth."""
-        self.centre = self.centre + change[:2]
-        self.kappa += float(change[2])
-        self.growth_px += float(change[5])
-        if change[3] != 0.0 or change[4] != 0.0:
-            self.tilt = self.tilt + change[3:5]
-            self.plane = self.plane.tilted(rotation_xy(change[3], change[4]))
-
-    def blur_of(self, lines: Lines) -> Array:
-        """Return the blur on each line (p,) [px]."""
-        if self.blur_xy is None:
-            return np.full(len(lines.edge), self.blur_px)
-        uu, uv, vv = self.blur_xy
-        square = lines.nu * lines.nu * uu + lines.nu * lines.nv * uv + lines.nv * lines.nv * vv
-        return np.asarray(np.sqrt(np.clip(square, 0.09, 36.0)))
-
-
-@dataclass(slots=True)
-class _Solved:
-    inverse: Array
-    weight: Array
-    residual: Array
-    inlier: NDArray[np.bool_]
-    moved: Array
+class _Step(NamedTuple):
+    ok: bool
+    solved: Solved
+    change: Array
     moved_px: float
-    chi2_reduced: float
     contrast: float
+    blur_px: float
+    blur_xy: Array
 
 
-def _fit_lines(state: _State, lines: Lines, free: list[int], tilt_sigma_rad: float) -> _Solved | None:
-    """Fit the parameters to one set of lines; ``state`` keeps its place, only its blur is updated."""
-    a = lines.design[:, free]
-    precision = np.zeros(len(free))
-    precision[-1] = 1.0 / GROWTH_SIGMA_PX**2
-    start = np.zeros(len(free))
-    start[-1] = state.growth_px
-    if len(free) == 6:
-        precision[3:5] = 1.0 / tilt_sigma_rad**2
-        start[3:5] = state.tilt
-    prior = np.diag(precision)
-    total = np.zeros(len(free))
+def _fit_lines(
+    lines: Lines,
+    free: NDArray[np.int64],
+    tilt: Array,
+    tilt_sigma_rad: float,
+    blur_px: float,
+    blur_xy: Array,
+    growth_px: float,
+) -> _Step:
+    """Fit the parameters to one set of lines: the change of centre x, y, kappa, tilt x, y and growth."""
+    a = lines.row[:, DESIGN + free]
+    n = len(free)
+    precision, start, base = np.zeros(n), np.zeros(n), np.zeros(n)
+    precision[n - 1] = 1.0 / GROWTH_SIGMA_PX**2
     # Growth is a parameter of the edges' places, which were laid without it.
-    total[-1] = state.growth_px
-    base = total.copy()
-    solved: _Solved | None = None
+    base[n - 1] = growth_px
+    if n == 6:
+        precision[3:5] = 1.0 / tilt_sigma_rad**2
+        start[3:5] = tilt
+    total = base.copy()
     for i in range(5):
-        measured = _displacements(state, lines, a @ total, float(total[-1]), free_blur=i < 4)
-        if measured is None:
-            return None
-        delta, sigma2, valid, contrast, ratio = measured
+        shift = times(a, total)
+        blur = line_blurs(lines, blur_xy)
+        gram = line_moments(lines, shift, total[n - 1], blur, crowded(lines, blur))
+        measured = measure(lines, gram, i < 4)
         pull = precision * (base - start - total)
-        solved = _least_squares(a, delta, sigma2, valid, prior, pull)
-        if solved is None:
-            return None
-        solved.contrast = contrast
-        total = total + solved.moved
-        step_px = float(np.abs(a @ solved.moved).max())
-        blur_before = state.blur_px
-        _update_blur(state, lines, ratio, solved.weight > 0.0)
-        if step_px < CLOSE_PX and 0.8 < state.blur_px / blur_before < 1.25:
+        solved = least_squares(a, measured.delta, measured.sigma2, measured.valid, precision, pull)
+        ok = measured.ok and solved.ok
+        if not ok:
             break
-    assert solved is not None
+        total = total + solved.change
+        step_px = float(np.abs(times(a, solved.change)).max())
+        blur_before = blur_px
+        blur_px, blur_xy = updated_blur(lines, blur_px, blur_xy, measured.ratio, solved.weight > 0.0)
+        if step_px < CLOSE_PX and 0.8 < blur_px / blur_before < 1.25:
+            break
     change = np.zeros(6)
-    change[free] = total - base
-    solved.moved_px = float(np.abs(a[:, :-1] @ (total - base)[:-1]).max())
-    solved.moved = change
-    return solved
+    for k in range(n):
+        change[free[k]] = total[k] - base[k]
+    moved = total - base
+    moved[n - 1] = 0.0
+    moved_px = float(np.abs(times(a, moved)).max())
+    return _Step(ok, solved, change, moved_px, measured.contrast, blur_px, blur_xy)
 
 
-def _displacements(
-    state: _State, lines: Lines, shift_px: Array, growth_px: float, free_blur: bool
-) -> tuple[Array, Array, NDArray[np.bool_], float, Array] | None:
-    """Measure each line's edge: displacement from ``shift_px`` [px], its variance, whether it is one at all.
-
-    Also returned: the contrast, and each line's change of the logarithm of the blur.
-    """
-    blur = state.blur_of(lines)
-    s = lines.side
-    per = (1.0 / blur)[:, None]
-    distance = lines.distance - (shift_px - blur * blur * lines.bend)[:, None]
-    t = distance * per
-    bell = np.exp(-0.5 * t * t)
-    rise = phi(t)
-    spread = t * bell
-    if (lines.gap_px - lines.half_px < 3.0 * blur).any():
-        # The neighbours grow the other way, and bend by their own radius.
-        grown = (2.0 * growth_px) * s - blur * blur * lines.bend
-        for offset in (
-            grown - lines.outward_px + blur * blur * lines.outward_bend,
-            grown + lines.inward_px + blur * blur * lines.inward_bend,
-        ):
-            tj = np.clip((distance + offset[:, None]) * per, -9.0, 9.0)
-            bj = np.exp(-0.5 * tj * tj)
-            rise = rise - phi(tj)
-            bell = bell - bj
-            spread = spread - tj * bj
-    basis = np.empty((len(s), 4, t.shape[1]))
-    np.multiply(s[:, None], rise, out=basis[:, 0])
-    np.multiply((-INV_SQRT_2PI * s)[:, None] * per, bell, out=basis[:, 1])
-    np.multiply((-INV_SQRT_2PI * s)[:, None], spread, out=basis[:, 2])
-    basis[:, 3] = lines.value
-    weighted = basis * lines.weight[:, None, :]
-    # Sums of products about the means of each line: its level is eliminated.
-    sums = weighted.sum(axis=2)
-    gram = weighted @ basis.transpose(0, 2, 1)
-    gram -= (sums / np.maximum(lines.total, 1.0)[:, None])[:, :, None] * sums[:, None, :]
-    power = gram[:, 3, 3]
-    solution, inverse_11 = _solve3(gram) if free_blur else _solve2(gram)
-    contrast = solution[0]
-    rest = power - (solution * gram[:, :3, 3].T).sum(axis=0)
-    dof = np.maximum(lines.total - 4.0, 1.0)
-    variance = np.maximum(rest, 0.0) / dof
-    middle = _median(contrast)
-    if not middle > 4.0:
-        return None
-    noise = max(_median(variance), 0.08)
-    seen = np.maximum(contrast, 1.0)
-    delta = solution[1] / seen
-    sigma2 = np.maximum(variance, noise) * inverse_11 / (seen * seen)
-    valid = (contrast > max(4.0, 0.3 * middle)) & (rest < np.maximum(0.15 * power, 8.0 * noise * dof))
-    valid &= (np.abs(delta) < lines.half_px) & (sigma2 < 1.0) & (lines.total >= 5.0)
-    if np.count_nonzero(valid) < 10:
-        return None
-    return delta, sigma2, valid, middle, solution[2] / seen
-
-
-def _least_squares(
-    a: Array, delta: Array, sigma2: Array, valid: NDArray[np.bool_], prior: Array, pull: Array
-) -> _Solved | None:
-    """Solve for the change of the parameters, robustly; lines that disagree lose their weight altogether."""
-    full = valid / (sigma2 + 1e-4)
-    delta = np.where(valid, delta, 0.0)
-    weight = full
-    for last in (False, False, True):
-        aw = a * weight[:, None]
-        try:
-            inverse = np.asarray(np.linalg.inv(aw.T @ a + prior))
-        except np.linalg.LinAlgError:
-            return None
-        change = inverse @ (aw.T @ delta + pull)
-        residual = delta - a @ change
-        size = np.abs(residual)
-        scale = max(1.4826 * _median(size[valid]), 0.01)
-        largest = float(size[valid].max())
-        if last or largest < 2.5 * scale:
-            break
-        huber = np.minimum(1.0, 2.0 * scale / np.maximum(size, 1e-12))
-        weight = full * huber * (size < max(5.0 * scale, 0.1))
-    inlier = valid & (size < max(5.0 * scale, 0.25))
-    n = int(np.count_nonzero(weight))
-    if n < 10:
-        return None
-    chi2 = float(weight @ (residual * residual)) / float(max(n - change.size, 1))
-    return _Solved(inverse, weight, residual, inlier, change, 0.0, chi2, 0.0)
-
-
-def _update_blur(state: _State, lines: Lines, ratio: Array, used: NDArray[np.bool_]) -> None:
-    """Move the blur by what the lines say; a blur that is not small may differ with the direction
-    (motion)."""
-    step = np.clip(ratio, -0.5, 0.5)
-    state.blur_px = min(6.0, max(0.3, state.blur_px * float(np.exp(_median(step[used])))))
-    if state.blur_px < 0.85:
-        state.blur_xy = None
-        return
-    square = (state.blur_of(lines) * np.exp(step))[used] ** 2
-    nu, nv = lines.nu[used], lines.nv[used]
-    columns = np.stack((nu * nu, nu * nv, nv * nv), axis=1)
-    keep = np.ones(len(square), dtype=np.bool_)
-    for _ in range(2):
-        if keep.sum() < 10:
-            return
-        found = np.asarray(np.linalg.lstsq(columns[keep], square[keep], rcond=None)[0])
-        off = np.abs(square - columns @ found)
-        keep = off < 3.0 * _median(off) + 1e-6
-    if np.isfinite(found).all():
-        state.blur_xy = found
-
-
-def _solve3(gram: Array) -> tuple[Array, Array]:
-    """Solve the 3x3 systems ``gram[:, :3, :3] x = gram[:, :3, 3]``; also return element (1, 1) of the
-    inverse."""
-    a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 0, 2]
-    d, e, f = gram[:, 1, 1], gram[:, 1, 2], gram[:, 2, 2] * 1.05 + 1e-12
-    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
-    c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
-    determinant = a * c00 + b * c01 + c * c02
-    determinant = np.where(determinant > 1e-12 * a * d * f, determinant, np.inf)
-    h0, h1, h2 = gram[:, 0, 3], gram[:, 1, 3], gram[:, 2, 3]
-    x = np.stack(
-        (c00 * h0 + c01 * h1 + c02 * h2, c01 * h0 + c11 * h1 + c12 * h2, c02 * h0 + c12 * h1 + c22 * h2)
-    )
-    return x / determinant, c11 / determinant
-
-
-def _solve2(gram: Array) -> tuple[Array, Array]:
-    """Solve the 2x2 systems without the blur; the third element of the solution is zero."""
-    a, b, d = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
-    determinant = a * d - b * b
-    determinant = np.where(determinant > 1e-12 * a * d, determinant, np.inf)
-    h0, h1 = gram[:, 0, 3], gram[:, 1, 3]
-    x = np.stack((d * h0 - b * h1, a * h1 - b * h0, np.zeros_like(a)))
-    return x / determinant, a / determinant
-
-
-def _result(state: _State, solved: _Solved, lines: Lines, edges: Edges, free: list[int]) -> Fit:
-    n_edges = len(edges.radius_m)
-    a = lines.design[:, free]
-    weight = solved.weight
-    aw = a * weight[:, None]
+def _result(
+    view: View,
+    centre: Array,
+    kappa: float,
+    tilt: Array,
+    blur_px: float,
+    growth_px: float,
+    step: _Step,
+    lines: Lines,
+    edges: Edges,
+    free: NDArray[np.int64],
+) -> Solution:
+    n = len(free)
+    a = lines.row[:, DESIGN + free]
+    solved = step.solved
+    covariance, considered = np.zeros((5, 5)), np.zeros((5, 3))
+    for k in range(3):
+        _, pulled = normal_equations(a, solved.weight, lines.row[:, CONSIDERED + k])
+        shift = times(solved.inverse, pulled)
+        for i in range(n - 1):
+            considered[free[i], k] = -shift[i]
     # Scatter of the displacements about the model scales the covariance, up and down.
-    covariance_free = solved.inverse * solved.chi2_reduced
-    gain = -solved.inverse @ (aw.T @ lines.considered)
-    rows = [i for i in free if i < 5]
-    keep = [n for n, i in enumerate(free) if i < 5]
-    covariance = np.zeros((5, 5))
-    covariance[np.ix_(rows, rows)] = covariance_free[np.ix_(keep, keep)]
-    considered = np.zeros((5, 3))
-    considered[rows] = gain[keep]
+    for i in range(n - 1):
+        for j in range(n - 1):
+            covariance[free[i], free[j]] = solved.inverse[i, j] * solved.chi2
     inlier = solved.inlier
-    laid = np.bincount(lines.edge, minlength=n_edges)
-    agreeing = np.bincount(lines.edge, weights=inlier, minlength=n_edges)
-    seen = np.flatnonzero(agreeing > 0.4 * laid)
-    inner = inlier & (lines.edge > 0)
-    wv = (lines.weight * lines.value)[inner].ravel()
-    slope = float(wv @ lines.red[inner].ravel()) / max(float(wv @ lines.value[inner].ravel()), 1e-9)
-    contradicted, share = 0.0, 1.0
-    if not inlier.all() and inlier.any():
-        white = _median(lines.level[inlier]) + 0.5 * solved.contrast
-        flat = np.abs(lines.value).max(axis=1) < 0.2 * solved.contrast
-        plain = flat & (np.abs(lines.level - white) < 0.15 * solved.contrast) & (lines.level < 248.0)
-        red = flat & (lines.red.mean(axis=1) > 1.3 * lines.level + 4.0)
-        contradicted = float(((plain | red) & ~inlier).mean())
-        # Each line stands for a piece of its edge.
-        length = edges.radius_m[lines.edge] / laid[lines.edge]
-        share = float(length @ inlier) / float(length.sum())
-    n_inlier = int(np.count_nonzero(inlier))
-    misses = solved.residual[inlier]
-    rms = float(np.sqrt(misses @ misses / n_inlier)) if n_inlier else float("inf")
-    return Fit(
-        state.plane,
-        state.centre,
-        state.kappa,
-        state.tilt,
+    laid, agreeing = counted(lines.edge, inlier, len(edges.radius_m))
+    share, contradicted, slope = agreement(lines, edges, laid, inlier, step.contrast)
+    return Solution(
+        True,
+        view.rotation,
+        centre,
+        kappa,
+        tilt,
         covariance,
         considered,
-        rms,
+        rms(solved.residual, inlier),
         share,
-        tuple(seen.tolist()),
-        state.blur_px,
-        state.growth_px,
-        solved.chi2_reduced,
-        n_inlier,
-        int((laid > 0).sum()),
-        3 in free,
-        np.stack((lines.u0, lines.v0), axis=1),
+        agreeing > 0.4 * laid,
+        blur_px,
+        growth_px,
+        solved.chi2,
+        int(np.count_nonzero(inlier)),
+        int(np.count_nonzero(laid)),
+        lines.row[:, U0 : V0 + 1].copy(),
         inlier,
         slope,
         contradicted,
     )
+
+
+def counted(edge: NDArray[np.int64], inlier: NDArray[np.bool_], n_edges: int) -> tuple[Array, Array]:
+    """Return how many lines lie on each edge and how many of them agree, both (k,)."""
+    return (
+        np.bincount(edge, minlength=n_edges).astype(np.float64),
+        np.bincount(edge[inlier], minlength=n_edges).astype(np.float64),
+    )
+
+
+def rms(residual: Array, used: NDArray[np.bool_]) -> float:
+    """Return the root mean square of the residuals in use."""
+    misses = residual[used]
+    return float(np.sqrt((misses @ misses) / len(misses))) if len(misses) else np.inf
+
+
+def agreement(
+    lines: Lines, edges: Edges, laid: Array, inlier: NDArray[np.bool_], contrast: float
+) -> tuple[float, float, float]:
+    """Return ``share``, ``contradicted`` and ``red_slope`` of ``Fit``."""
+    value = lines.pixels[:, :, VALUE] - lines.row[:, LEVEL, None]
+    red = lines.pixels[:, :, RED]
+    inner = inlier & (lines.edge > 0)
+    wv = (lines.pixels[:, :, WEIGHT] * value)[inner].ravel()
+    slope = float(wv @ red[inner].ravel()) / max(float(wv @ value[inner].ravel()), 1e-9)
+    if inlier.all() or not inlier.any():
+        return 1.0, 0.0, slope
+    # Where there is no edge at all: as much red as everywhere, or none.
+    level = lines.row[:, LEVEL]
+    white = median(level[inlier]) + 0.5 * contrast
+    flat = ~inlier & (np.abs(value).max(axis=1) < 0.2 * contrast)
+    contrary = flat & is_contrary(level, red.mean(axis=1), white, contrast)
+    # Each line stands for a piece of its edge.
+    length = edges.radius_m[lines.edge] / laid[lines.edge]
+    return float(length @ inlier) / float(length.sum()), float(contrary.mean()), slope
+
+
+def is_contrary(level: Any, red: Any, white: float, contrast: float) -> Any:
+    """Return whether a place without an edge is white or red, rather than covered by something else."""
+    plain = (np.abs(level - white) < 0.15 * contrast) & (level < 248.0)
+    return plain | (red > 1.3 * level + 4.0)
+
+
+def _no_solution() -> Solution:
+    nothing, none = np.zeros((0, 0)), np.zeros(0)
+    return Solution(
+        False, nothing, none, 0.0, none, nothing, nothing, 0.0, 0.0, np.zeros(0, dtype=np.bool_),
+        0.0, 0.0, 0.0, 0, 0, nothing, np.zeros(0, dtype=np.bool_), 0.0, 0.0,
+    )  # fmt: skip

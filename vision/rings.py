@@ -13,13 +13,16 @@ cut by the frame, a bar or a shadow. Both return several hypotheses, best first;
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.plane import LevelPlane
+from vision.lines import edge_sides
+from vision.view import View, either, inside, pixel_rays, rays_to_plane, units_per_pixel
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -28,6 +31,12 @@ Image = NDArray[np.uint8]
 CONTOUR_INSET_PX = 0.45
 """How far inside the red region a contour point lies, in pixels of the mask (half a pixel less the
 threshold's overshoot: a ratio threshold of 1.3 trips at 38 % red)."""
+MIN_POINTS = 6
+"""Fewest points of a contour that is looked at."""
+ENOUGH_POINTS = 100
+"""Points of a contour beyond which not all are used."""
+TOLERANCE = 0.06
+"""Spread of a circle's radius, relative to it, up to which a contour is taken for one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +82,7 @@ def halve(image: Image) -> Image:
     return np.asarray(cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
 
 
-def find_contours(mask: Image, half: bool, min_points: int = 6, max_contours: int = 48) -> Contours:
+def find_contours(mask: Image, half: bool, min_points: int = MIN_POINTS, max_contours: int = 48) -> Contours:
     """Trace the boundaries of a mask; the longest ``max_contours`` with at least ``min_points`` are kept."""
     found, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     step = 2.0 if half else 1.0
@@ -83,138 +92,209 @@ def find_contours(mask: Image, half: bool, min_points: int = 6, max_contours: in
     if not keep:
         empty = np.empty(0)
         return Contours(empty, empty, np.zeros(1, dtype=np.int64), np.empty(0, dtype=bool), step)
-    xy = np.concatenate([found[i] for i in keep]).reshape(-1, 2).astype(np.float64)
+    xy = np.concatenate([found[i] for i in keep]).reshape(-1, 2).T.astype(np.float64, order="C")
     start = np.zeros(len(keep) + 1, dtype=np.int64)
     np.cumsum([len(found[i]) for i in keep], out=start[1:])
     parents = np.asarray(hierarchy).reshape(-1, 4)[:, 3]
     if half:
         xy *= 2.0
         xy += 0.5
-    return Contours(xy[:, 0], xy[:, 1], start, parents[keep] >= 0, step)
+    return Contours(xy[0], xy[1], start, parents[keep] >= 0, step)
 
 
-@dataclass(frozen=True, slots=True)
-class Circles:
-    """Circles through whole contours, in the level plane: centres (m, 2), radii (m,), radial spread (m,)."""
+def contour_sums(
+    view: View, u: Array, v: Array, start: IntArray, stride: IntArray, margin_px: float
+) -> tuple[Array, IntArray]:
+    """Fit a circle to each contour's points inside the image, in the level plane, by linear least squares
+    (Kasa).
 
-    centre: Array
-    radius: Array
-    spread: Array
-    count: IntArray
-
-
-def fit_circles(qx: Array, qy: Array, start: IntArray) -> Circles:
-    """Fit a circle to each run of points by linear least squares (Kasa), all runs at once.
-
-    ``qx``, ``qy`` (n,); run ``i`` is ``start[i]:start[i + 1]``. The radius is the mean distance from the
-    centre, the spread the standard deviation of that distance.
+    Contour ``i`` is ``start[i]:start[i + 1]`` of the pixels ``u``, ``v`` (n,), of which every
+    ``stride[i]``-th is used. Returned are (m, 4) centre x, y, radius (the mean distance from the centre) and
+    spread (the standard deviation of that distance), and how many points (m,); contours of fewer than
+    ``MIN_POINTS`` have zeros.
     """
-    first = start[:-1]
-    count = np.diff(start)
-    mx = np.add.reduceat(qx, first) / count
-    my = np.add.reduceat(qy, first) / count
-    x = qx - np.repeat(mx, count)
-    y = qy - np.repeat(my, count)
+    length = np.diff(start)
+    index = np.arange(len(u)) - np.repeat(start[:-1], length)
+    seen = inside(view, u, v, margin_px) & (index % np.repeat(stride, length) == 0)
+    count = np.add.reduceat(seen, start[:-1], dtype=np.int64)
+    out = np.zeros((len(count), 4))
+    many = count >= MIN_POINTS
+    use = seen & np.repeat(many, length)
+    if not use.any():
+        return out, count
+    u, v, n = u[use], v[use], count[many]
+    x, y = pixel_rays(view, u, v)
+    qx, qy = rays_to_plane(view, x, y, v)
+    first = np.cumsum(n) - n
+    mx = np.add.reduceat(qx, first) / n
+    my = np.add.reduceat(qy, first) / n
+    x = qx - np.repeat(mx, n)
+    y = qy - np.repeat(my, n)
     xx, yy = x * x, y * y
     z = xx + yy
     sums = np.add.reduceat(np.stack((xx, yy, x * y, x * z, y * z)), first, axis=1)
-    sxx, syy, sxy, sxz, syz = sums
+    ax, ay = kasa_centre(sums[0], sums[1], sums[2], sums[3], sums[4])
+    rho = np.hypot(x - np.repeat(ax, n), y - np.repeat(ay, n))
+    s1, s2 = np.add.reduceat(np.stack((rho, rho * rho)), first, axis=1) / n
+    out[many] = np.stack((ax + mx, ay + my, s1, np.sqrt(np.maximum(s2 - s1 * s1, 0.0))), axis=1)
+    return out, count
+
+
+def kasa_centre(sxx: Any, syy: Any, sxy: Any, sxz: Any, syz: Any) -> tuple[Any, Any]:
+    """Return the centre of a circle from moments about the points' mean, with z = x^2 + y^2."""
     determinant = sxx * syy - sxy * sxy
-    determinant = np.where(determinant > 1e-12 * (sxx + syy) ** 2, determinant, np.inf)
-    ax = 0.5 * (sxz * syy - syz * sxy) / determinant
-    ay = 0.5 * (syz * sxx - sxz * sxy) / determinant
-    rho = np.hypot(x - np.repeat(ax, count), y - np.repeat(ay, count))
-    s1, s2 = np.add.reduceat(np.stack((rho, rho * rho)), first, axis=1) / count
-    spread = np.sqrt(np.maximum(s2 - s1 * s1, 0.0))
-    return Circles(np.stack((ax + mx, ay + my), axis=1), s1, spread, count)
+    determinant = either(determinant > 1e-12 * (sxx + syy) ** 2, determinant, np.inf)
+    return 0.5 * (sxz * syy - syz * sxy) / determinant, 0.5 * (syz * sxx - sxz * sxy) / determinant
 
 
 def identify_circles(
-    contours: Contours, plane: LevelPlane, edges_m: Array, tolerance: float = 0.06, limit: int = 4
+    contours: Contours, view: View, edges_m: Array, labeller: Labeller | None = None, limit: int = 4
 ) -> list[Hypothesis]:
     """Label whole contours as edges of the target and return hypotheses, best first.
 
-    Every contour that is a circle to within ``tolerance`` of its radius (plus a pixel) is tried as every
-    edge of its type; the other circles about the same centre then have to lie at that scale's radii. A
-    single small disc is offered as the outermost edge, with a low score.
+    Every contour that is a circle (to within ``TOLERANCE`` of its radius plus about half a pixel) is tried as
+    every edge of its type; the other circles about the same centre then have to lie at that scale's radii. A
+    single small disc is offered as the outermost edge, with a low score. ``labeller`` is ``label_circles`` or
+    its compiled form.
     """
     if not len(contours):
         return []
-    qx, qy = plane.from_pixels(contours.u, contours.v)
-    inside = plane.inside(contours.u, contours.v, margin_px=contours.step_px)
-    start = contours.start
-    hole = contours.hole
-    if not inside.all():
-        counts = np.add.reduceat(inside, start[:-1])
-        qx, qy = qx[inside], qy[inside]
-        hole = hole[counts >= 6]
-        few = np.repeat(counts < 6, counts)
-        qx, qy = qx[~few], qy[~few]
-        start = np.concatenate(([0], np.cumsum(counts[counts >= 6])))
-        if len(start) < 2:
-            return []
-    circles = fit_circles(qx, qy, start)
-    unit = contours.step_px * plane.units_per_pixel(circles.centre[:, 0], circles.centre[:, 1])
-    side = np.where(hole, -1.0, 1.0)
-    radius = circles.radius + CONTOUR_INSET_PX * side * unit
-    good = (circles.spread < tolerance * circles.radius + 0.45 * unit) & (radius > 0.3 * unit)
-    good &= np.isfinite(radius)
-    if not good.any():
-        return []
-    return _label(
-        circles.centre[good], radius[good], side[good], circles.count[good], unit[good], edges_m, limit
+    label = label_circles if labeller is None else labeller
+    found, edges = label(
+        view, contours.u, contours.v, contours.start, contours.hole, contours.step_px, edges_m, limit
     )
+    return [
+        Hypothesis(row[:2], float(row[2]), tuple(np.flatnonzero(seen).tolist()), float(row[3]))
+        for row, seen in zip(found, edges, strict=True)
+    ]
 
 
-def _label(
-    centre: Array, radius: Array, side: Array, count: IntArray, unit: Array, edges_m: Array, limit: int
-) -> list[Hypothesis]:
-    edge_side = np.where(np.arange(len(edges_m)) % 2 == 0, 1.0, -1.0)
-    trial_circle, trial_edge = np.nonzero(side[:, None] == edge_side[None, :])
-    kappa = radius[trial_circle] / edges_m[trial_edge]
-    # Each trial against each circle: nearest edge of the circle's type, and the distance between centres.
-    predicted = kappa[:, None] * edges_m[None, :]
+def label_circles(
+    view: View,
+    u: Array,
+    v: Array,
+    start: IntArray,
+    hole: NDArray[np.bool_],
+    step_px: float,
+    edges_m: Array,
+    limit: int,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Do the work of ``identify_circles`` on plain arrays: (h, 4) centre x, y, kappa and score, and (h, k) which
+    edges support each.
+    """
+    n_edges = len(edges_m)
+    stride = np.maximum(np.diff(start) // ENOUGH_POINTS, 1)
+    sums, points = contour_sums(view, u, v, start, stride, step_px)
+    good = np.zeros(len(points), dtype=np.bool_)
+    side, unit, radii = np.zeros(len(points)), np.zeros(len(points)), np.zeros(len(points))
+    for i in range(len(points)):
+        if points[i] >= MIN_POINTS:
+            side[i] = -1.0 if hole[i] else 1.0
+            unit[i] = step_px * units_per_pixel(view, sums[i, 0], sums[i, 1])
+            radii[i] = sums[i, 2] + CONTOUR_INSET_PX * side[i] * unit[i]
+            # Not true of NaN.
+            good[i] = sums[i, 3] < TOLERANCE * sums[i, 2] + 0.45 * unit[i] and radii[i] > 0.3 * unit[i]
+    chosen = np.flatnonzero(good)
+    centre, radius, side, unit = sums[chosen, :2].copy(), radii[chosen], side[chosen], unit[chosen]
+    count = points[chosen] * stride[chosen]
+    length = count * unit
+    # Each circle as each edge of its type.
+    trials = [(i, e) for i in range(len(chosen)) for e in range(n_edges) if (e % 2 == 0) == (side[i] > 0.0)]
+    if not trials:
+        return np.zeros((0, 4)), np.zeros((0, n_edges), dtype=np.bool_)
+    circle = np.array([trial[0] for trial in trials])
+    edge = np.array([trial[1] for trial in trials])
+    score, label, matched = match_trials(centre, radius, side, length, unit, circle, edge, edges_m)
+    return _distinct(centre, radius, count / unit, score, label, matched, edges_m, limit)
+
+
+Labeller = Callable[
+    [View, Array, Array, IntArray, NDArray[np.bool_], float, Array, int], tuple[Array, NDArray[np.bool_]]
+]
+
+
+def is_match(error: Any, apart: Any, radius: Any, unit: Any) -> Any:
+    """Return whether a circle lies where the target has an edge: ``error`` of its radius, ``apart`` its centre."""
+    return (error < 0.035 * radius + 0.6 * unit) & (apart < 0.12 * radius + 0.9 * unit)
+
+
+def is_around(apart: Any, radius: Any, side: Any, unit: Any, outermost: Any) -> Any:
+    """Return whether a circle is red outside of the outermost edge, about the same centre: there is none."""
+    return (apart < 0.15 * radius) & (side > 0.0) & (radius > 1.15 * outermost + unit)
+
+
+def match_trials(
+    centre: Array,
+    radius: Array,
+    side: Array,
+    length: Array,
+    unit: Array,
+    circle: IntArray,
+    edge: IntArray,
+    edges_m: Array,
+) -> tuple[Array, IntArray, NDArray[np.bool_]]:
+    """Score the trials "circle ``circle[i]`` is edge ``edge[i]``" (t,) by how much boundary agrees with each.
+
+    Returned are the scores (t,), and for each circle its nearest edge and whether it matches it (t, m).
+    """
+    edge_side = edge_sides(len(edges_m))
+    kappa = radius[circle] / edges_m[edge]
+    predicted = kappa[:, None] * edges_m
     misfit = np.abs(predicted[:, None, :] - radius[None, :, None])
-    misfit = np.where(side[None, :, None] == edge_side[None, None, :], misfit, np.inf)
+    misfit = np.where(side[None, :, None] == edge_side, misfit, np.inf)
     label = np.argmin(misfit, axis=2)
     error = np.take_along_axis(misfit, label[:, :, None], axis=2)[:, :, 0]
     apart = np.hypot(
-        centre[trial_circle, 0][:, None] - centre[None, :, 0],
-        centre[trial_circle, 1][:, None] - centre[None, :, 1],
+        centre[circle, 0][:, None] - centre[None, :, 0], centre[circle, 1][:, None] - centre[None, :, 1]
     )
-    slack = 0.6 * unit[None, :]
-    match = (error < 0.035 * radius[None, :] + slack) & (apart < 0.12 * radius[None, :] + 1.5 * slack)
-    weight = np.where(match, count[None, :] * unit[None, :], 0.0)
-    support = weight.sum(axis=1)
+    matched = is_match(error, apart, radius[None, :], unit[None, :])
+    support = np.where(matched, length[None, :], 0.0).sum(axis=1)
     # The support that a complete target would have: circumference of the edges that are large enough to be
     # traced.
-    visible = predicted > 1.5 * unit[trial_circle][:, None]
-    expected = 2.0 * np.pi * (predicted * visible).sum(axis=1) + 1e-12
-    n_matched = match.sum(axis=1)
+    traceable = predicted > 1.5 * unit[circle][:, None]
+    expected = 2.0 * np.pi * (predicted * traceable).sum(axis=1) + 1e-12
+    n_matched = matched.sum(axis=1)
     score = support / expected * np.minimum(1.0, 0.5 * n_matched)
-    lonely = (n_matched < 2) & ~((trial_edge == 0) & (radius[trial_circle] < 25.0 * unit[trial_circle]))
-    score[lonely] = 0.0
-    # Nothing red lies outside the outermost edge, about the same centre.
-    outside = (apart < 0.15 * radius[None, :]) & (side[None, :] > 0.0)
-    outside &= radius[None, :] > 1.15 * predicted[:, :1] + unit[None, :]
-    score[outside.any(axis=1)] = 0.0
-    hypotheses: list[Hypothesis] = []
-    clear = int(np.argmax(score))
-    if score[clear] > 0.6 and n_matched[clear] >= min(4, len(edges_m)):
+    score[(n_matched < 2) & ~((edge == 0) & (radius[circle] < 25.0 * unit[circle]))] = 0.0
+    score[is_around(apart, radius[None, :], side[None, :], unit[None, :], predicted[:, :1]).any(axis=1)] = 0.0
+    return score, label, matched
+
+
+def _distinct(
+    centre: Array,
+    radius: Array,
+    weight: Array,
+    score: Array,
+    label: IntArray,
+    matched: NDArray[np.bool_],
+    edges_m: Array,
+    limit: int,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the best hypotheses that differ from each other, fitted to the circles that support them."""
+    found, edges = np.zeros((limit, 4)), np.zeros((limit, len(edges_m)), dtype=np.bool_)
+    n = 0
+    best = int(np.argmax(score))
+    if score[best] > 0.6 and np.count_nonzero(matched[best]) >= min(4, len(edges_m)):
         limit = 1
-    for t in np.argsort(-score, kind="stable"):
-        if score[t] <= 0.0 or len(hypotheses) == limit:
+    for t in np.argsort(-score, kind="mergesort"):
+        if score[t] <= 0.0 or n == limit:
             break
-        m = match[t]
-        w = count[m] / unit[m]
-        r = edges_m[label[t, m]]
-        scale = float((w * r * radius[m]).sum() / (w * r * r).sum())
-        place = (w[:, None] * centre[m]).sum(axis=0) / w.sum()
-        if any(
-            abs(h.kappa / scale - 1.0) < 0.05 and np.hypot(*(h.centre - place)) < 0.2 * scale * edges_m[0]
-            for h in hypotheses
-        ):
-            continue
-        labels = tuple(sorted({int(k) for k in label[t, m]}))
-        hypotheses.append(Hypothesis(place, scale, labels, float(score[t])))
-    return hypotheses
+        total, x, y, wr, wrr = 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in np.flatnonzero(matched[t]):
+            w, r = weight[j], edges_m[label[t, j]]
+            total += w
+            x += w * centre[j, 0]
+            y += w * centre[j, 1]
+            wr += w * r * radius[j]
+            wrr += w * r * r
+        kappa, x, y = wr / wrr, x / total, y / total
+        known = False
+        for i in range(n):
+            near = np.hypot(found[i, 0] - x, found[i, 1] - y) < 0.2 * kappa * edges_m[0]
+            known = known or (near and abs(found[i, 2] / kappa - 1.0) < 0.05)
+        if not known:
+            found[n, 0], found[n, 1], found[n, 2], found[n, 3] = x, y, kappa, score[t]
+            for j in np.flatnonzero(matched[t]):
+                edges[n, label[t, j]] = True
+            n += 1
+    return found[:n], edges[:n]

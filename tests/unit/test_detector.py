@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from vision.overlay import centre_ellipse, draw_overlay
 CAMERA = Camera.from_fov(640, 480, math.radians(62.2))
 THESIS, RECOMMENDED = RingTarget.thesis(1.0), RingTarget.recommended(1.0)
 NOISY = Conditions(read_noise=3.0)
+detector_of = partial(TargetDetector, engine="numpy")
 
 
 def attitude(roll_deg, pitch_deg, yaw_deg):
@@ -40,7 +42,7 @@ def scene(target, height, roll, pitch, yaw, pixel, conditions=NOISY, camera=CAME
 )
 def test_finds_the_target_near_and_far(target, height, bound):
     image, R_nc, truth = scene(target, height, 20.0, -15.0, 70.0, (330.0, 250.0))
-    fix = TargetDetector(CAMERA, target).detect(image, R_nc)
+    fix = detector_of(CAMERA, target).detect(image, R_nc)
     assert isinstance(fix, VisionFix)
     assert np.linalg.norm(fix.position_cam_m - truth) < bound * np.linalg.norm(truth)
     error = fix.position_cam_m - truth
@@ -52,13 +54,13 @@ def test_covariance_grows_with_distance():
     sigmas = []
     for height in (1.0, 3.0, 10.0, 30.0):
         image, R_nc, _ = scene(THESIS, height, 10.0, 5.0, 0.0, (320.0, 240.0))
-        sigmas.append(TargetDetector(CAMERA, THESIS).detect(image, R_nc).covariance_m2[2, 2] ** 0.5)
+        sigmas.append(detector_of(CAMERA, THESIS).detect(image, R_nc).covariance_m2[2, 2] ** 0.5)
     assert sigmas == sorted(sigmas)
 
 
 def test_prior_gives_the_same_fix_as_the_search():
     image, R_nc, truth = scene(THESIS, 6.0, 12.0, 8.0, 30.0, (300.0, 200.0))
-    detector = TargetDetector(CAMERA, THESIS)
+    detector = detector_of(CAMERA, THESIS)
     found = detector.detect(image, R_nc)
     tracked = detector.detect(image, R_nc, prior=found)
     by_position = detector.detect(image, R_nc, prior=truth * 1.003)
@@ -69,9 +71,33 @@ def test_prior_gives_the_same_fix_as_the_search():
     assert lost.method == "found"
 
 
+@pytest.mark.parametrize(
+    ("roll", "conditions", "options"),
+    [
+        (12.0, NOISY, {}),
+        (-20.0, Conditions(bar_px=18.0, read_noise=3.0), {"deck_tilt_sigma_rad": 0.05}),
+        (8.0, Conditions(motion_px=5.0, motion_angle_rad=0.6, read_noise=3.0), {"focal_sigma": 0.003}),
+    ],
+    ids=["plain", "bar, tilt", "motion"],
+)
+def test_compiled_and_numpy_give_the_same_fix(roll, conditions, options):
+    pytest.importorskip("numba")
+    lens = Camera(640, 480, 520.0, 524.0, 322.0, 236.0, (-0.12, 0.03, 0.001, -0.0005, 0.0), readout_s=0.02)
+    for camera, height, pixel in ((CAMERA, 3.0, (300.0, 220.0)), (lens, 6.0, (60.0, 250.0))):
+        image, R_nc, truth = scene(RECOMMENDED, height, roll, 5.0, 40.0, pixel, conditions, camera)
+        both = [TargetDetector(camera, RECOMMENDED, engine=e, **options) for e in ("compiled", "numpy")]
+        for attitude, prior in ((R_nc, None), (R_nc, truth * 1.002), (None, None)):
+            rate = np.array([0.2, -0.1, 0.3])
+            a, b = (d.detect(image, attitude, prior, rate) for d in both)
+            assert isinstance(a, VisionFix)
+            np.testing.assert_allclose(a.position_cam_m, b.position_cam_m, rtol=1e-9, atol=1e-11)
+            np.testing.assert_allclose(a.covariance_m2, b.covariance_m2, rtol=1e-6, atol=1e-14)
+            assert (a.rings, a.method) == (b.rings, b.method)
+
+
 def test_works_without_attitude():
     image, _, truth = scene(THESIS, 4.0, 15.0, -10.0, 40.0, (280.0, 220.0))
-    detector = TargetDetector(CAMERA, THESIS)
+    detector = detector_of(CAMERA, THESIS)
     fix = detector.detect(image)
     assert np.linalg.norm(fix.position_cam_m - truth) < 0.004 * np.linalg.norm(truth)
 
@@ -79,7 +105,7 @@ def test_works_without_attitude():
 def test_measures_a_tilted_deck():
     deck = quat_to_matrix(euler_to_quat(*np.radians([4.0, -3.0, 0.0])))
     image, R_nc, truth = scene(THESIS, 5.0, 10.0, 12.0, 20.0, (320.0, 230.0), R_nd=deck)
-    fix = TargetDetector(CAMERA, THESIS).detect(image, R_nc)
+    fix = detector_of(CAMERA, THESIS).detect(image, R_nc)
     assert np.linalg.norm(fix.position_cam_m - truth) < 2e-3 * np.linalg.norm(truth)
     tilt = math.acos(deck[:, 2] @ np.array([0.0, 0.0, 1.0]))
     assert np.hypot(*fix.tilt_rad) == pytest.approx(tilt, abs=math.radians(0.3))
@@ -102,21 +128,21 @@ def test_measures_a_tilted_deck():
 )
 def test_bears_bad_light_and_things_in_the_way(conditions):
     image, R_nc, truth = scene(THESIS, 5.0, 15.0, 10.0, -50.0, (310.0, 260.0), conditions)
-    fix = TargetDetector(CAMERA, THESIS).detect(image, R_nc)
+    fix = detector_of(CAMERA, THESIS).detect(image, R_nc)
     assert isinstance(fix, VisionFix)
     assert np.linalg.norm(fix.position_cam_m - truth) < 2e-3 * np.linalg.norm(truth)
 
 
 def test_finds_a_target_partly_out_of_the_frame():
     image, R_nc, truth = scene(THESIS, 5.0, 10.0, -5.0, 15.0, (12.0, 250.0))
-    fix = TargetDetector(CAMERA, THESIS).detect(image, R_nc)
+    fix = detector_of(CAMERA, THESIS).detect(image, R_nc)
     assert np.linalg.norm(fix.position_cam_m - truth) < 2e-3 * np.linalg.norm(truth)
 
 
 def test_lens_distortion_is_taken_out():
     camera = Camera(640, 480, 520.0, 524.0, 322.0, 236.0, (-0.12, 0.03, 0.001, -0.0005, 0.0))
     image, R_nc, truth = scene(THESIS, 4.0, 8.0, 12.0, 30.0, (150.0, 120.0), camera=camera)
-    fix = TargetDetector(camera, THESIS).detect(image, R_nc)
+    fix = detector_of(camera, THESIS).detect(image, R_nc)
     assert np.linalg.norm(fix.position_cam_m - truth) < 1e-3 * np.linalg.norm(truth)
 
 
@@ -126,7 +152,7 @@ def test_rolling_shutter_is_taken_out_with_the_body_rate():
     image, R_nc, truth = scene(
         THESIS, 5.0, 10.0, -5.0, 15.0, (300.0, 330.0), camera=camera, rate_c_radps=R_CB_NOMINAL @ rate_body
     )
-    detector = TargetDetector(camera, THESIS)
+    detector = detector_of(camera, THESIS)
     corrected = detector.detect(image, R_nc, body_rate_radps=rate_body)
     ignored = detector.detect(image, R_nc)
     assert np.linalg.norm(corrected.position_cam_m - truth) < 5e-4 * np.linalg.norm(truth)
@@ -137,34 +163,34 @@ def test_rolling_shutter_is_taken_out_with_the_body_rate():
 
 def test_stated_errors_widen_the_covariance_by_what_they_do():
     image, R_nc, truth = scene(THESIS, 5.0, 0.0, 0.0, 0.0, (319.5, 239.5))
-    plain = TargetDetector(CAMERA, THESIS).detect(image, R_nc)
-    focal = TargetDetector(CAMERA, THESIS, focal_sigma=0.003).detect(image, R_nc)
+    plain = detector_of(CAMERA, THESIS).detect(image, R_nc)
+    focal = detector_of(CAMERA, THESIS, focal_sigma=0.003).detect(image, R_nc)
     assert math.sqrt(focal.covariance_m2[2, 2]) == pytest.approx(0.003 * truth[2], rel=0.05)
     off = Camera(640, 480, CAMERA.fx * 1.003, CAMERA.fy * 1.003)
-    shifted = TargetDetector(off, THESIS).detect(image, R_nc)
+    shifted = detector_of(off, THESIS).detect(image, R_nc)
     assert shifted.position_cam_m[2] - plain.position_cam_m[2] == pytest.approx(0.003 * truth[2], rel=0.05)
-    turned = TargetDetector(CAMERA, THESIS, attitude_sigma_rad=0.01).detect(image, R_nc)
+    turned = detector_of(CAMERA, THESIS, attitude_sigma_rad=0.01).detect(image, R_nc)
     assert math.sqrt(turned.covariance_m2[0, 0]) == pytest.approx(0.01 * truth[2], rel=0.05)
 
 
 def test_thesis_method_is_reached_through_the_same_call():
     target = RingTarget.thesis()
     image, R_nc, truth = scene(target, 0.8, 0.0, 0.0, 0.0, (319.5, 239.5))
-    fix = TargetDetector(CAMERA, target, method="thesis").detect(image, R_nc)
+    fix = detector_of(CAMERA, target, method="thesis").detect(image, R_nc)
     assert fix.method == "thesis"
     assert np.linalg.norm(fix.position_cam_m - truth) < 0.08 * np.linalg.norm(truth)
 
 
 def test_no_fix_without_a_target():
     image, R_nc, _ = scene(THESIS, 8.0, 0.0, 0.0, 0.0, (320.0, 240.0), Conditions(target=False))
-    result = TargetDetector(CAMERA, THESIS).detect(image, R_nc)
+    result = detector_of(CAMERA, THESIS).detect(image, R_nc)
     assert isinstance(result, NoFix)
     assert not result
     assert "no red region" in result.reason
 
 
 def test_no_false_fix_among_distractors():
-    detector = TargetDetector(CAMERA, THESIS)
+    detector = detector_of(CAMERA, THESIS)
     for seed in range(12):
         conditions = Conditions(target=False, distractors=5, boats=2, read_noise=3.0)
         image, R_nc, _ = scene(THESIS, 8.0, 10.0, 5.0, 0.0, (320.0, 240.0), conditions, seed=seed)
@@ -179,7 +205,7 @@ def test_no_false_fix_on_the_sea(data_dir):
         camera = Camera.from_fov(image.shape[1], image.shape[0], math.radians(62.2))
         for target in (THESIS, RECOMMENDED):
             for R_nc in (attitude(0.0, 0.0, 0.0), attitude(0.0, 50.0, 0.0), None):
-                assert isinstance(TargetDetector(camera, target).detect(image, R_nc), NoFix), photo.name
+                assert isinstance(detector_of(camera, target).detect(image, R_nc), NoFix), photo.name
 
 
 IMAGE = np.zeros((480, 640, 3), dtype=np.uint8)
@@ -200,7 +226,7 @@ IMAGE = np.zeros((480, 640, 3), dtype=np.uint8)
 )
 def test_refuses_what_is_no_image_of_the_camera(image, words):
     with pytest.raises(ValueError, match=words):
-        TargetDetector(CAMERA, THESIS).detect(image)
+        detector_of(CAMERA, THESIS).detect(image)
 
 
 @pytest.mark.parametrize(
@@ -217,12 +243,18 @@ def test_refuses_what_is_no_image_of_the_camera(image, words):
 )
 def test_refuses_arguments_by_name(arguments, words):
     with pytest.raises(ValueError, match=words):
-        TargetDetector(CAMERA, THESIS).detect(IMAGE, **arguments)
+        detector_of(CAMERA, THESIS).detect(IMAGE, **arguments)
 
 
 @pytest.mark.parametrize(
     "options",
-    [{"method": "magic"}, {"focal_sigma": -1.0}, {"attitude_sigma_rad": math.nan}, {"R_cb": np.ones((3, 3))}],
+    [
+        {"method": "magic"},
+        {"engine": "magic"},
+        {"focal_sigma": -1.0},
+        {"attitude_sigma_rad": math.nan},
+        {"R_cb": np.ones((3, 3))},
+    ],
 )
 def test_refuses_options_by_name(options):
     with pytest.raises(ValueError, match=next(iter(options))):
@@ -231,7 +263,7 @@ def test_refuses_options_by_name(options):
 
 def test_overlay_draws_fix_and_reason():
     image, R_nc, _ = scene(THESIS, 5.0, 10.0, -5.0, 15.0, (300.0, 250.0))
-    fix = TargetDetector(CAMERA, THESIS).detect(image, R_nc)
+    fix = detector_of(CAMERA, THESIS).detect(image, R_nc)
     before = image.copy()
     drawn = draw_overlay(CAMERA, THESIS, image, fix)
     assert np.array_equal(image, before)
