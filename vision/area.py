@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vision.lines import edge_sides
 from vision.plane import LevelPlane, rotation_xy
-from vision.profile import INV_SQRT_2PI, phi
+from vision.profile import edge_profile, gaussian_part, pixel_box
 from vision.refine import Fit
 
 Array = NDArray[np.float64]
@@ -148,7 +148,7 @@ def fit_area(
         return None
     state = _State(rough.plane, rough.centre, rough.kappa, rough.tilt, rough.blur_px, rough.growth_px)
     model = _Model(patch.thinned(MAX_PIXELS), edges_m, margin_m, unit, sectors, tilt_sigma_rad)
-    solved = model.descend(state, 8, 0.004)
+    solved = model.descend(state, 12, 0.002)
     if solved is None:
         return None
     # The same pixels with the same weights, explained by a disc.
@@ -200,9 +200,13 @@ class _Model:
         sides = edge_sides(len(edges_m))
         rk = kappa * edges_m
         bend = np.minimum(width * width / (2.0 * rk), 0.5 * rk)
-        t = (rho[:, None] - rk + bend - sides * (state.growth_px * slope)[:, None]) / width
-        cdf = phi(t) * sides
-        bell = np.exp(-0.5 * t * t) * (INV_SQRT_2PI * sides) / width
+        # Everything along the gradient, in pixels: distance, a pixel's width, and the blur without it.
+        box = pixel_box(gx / plane.camera.fx / slope, gy / plane.camera.fy / slope)[:, None]
+        sigma = gaussian_part(blur, box)
+        away = (rho[:, None] - rk + bend) / slope[:, None] - sides * state.growth_px
+        rise, steepness, wider = edge_profile(away, sigma, box)
+        cdf = rise * sides
+        bell = steepness * sides / slope[:, None]
         linear = self._light(ex / (kappa * edges_m[0]), ey / (kappa * edges_m[0]), cdf)
         n_lin = linear.shape[1]
         ridge = np.full(n_lin, 1e-3)
@@ -222,11 +226,14 @@ class _Model:
         columns[:, 3] = -steep * (nx * qx * qy + ny * (1.0 + qy * qy))
         columns[:, 4] = steep * (nx * (1.0 + qx * qx) + ny * qx * qy)
         columns[:, 5] = -(pull @ sides) * slope
-        columns[:, 6] = -(pull * (t * width - 2.0 * bend)).sum(axis=1)
-        considered = np.empty((len(rho), 3))
+        widened = wider * sides * (blur * blur / sigma) * contrast_of_pixel[:, None]
+        widened[:, 0] += wider[:, 0] * (blur * blur / sigma[:, 0]) * outer
+        columns[:, 6] = widened.sum(axis=1) + 2.0 * (pull * bend).sum(axis=1)
+        considered = np.empty((len(rho), 4))
         considered[:, 0] = -steep * (gx * x + gy * y)
         considered[:, 1] = -steep * gx / plane.camera.fx
         considered[:, 2] = -steep * gy / plane.camera.fy
+        considered[:, 3] = -steep * slope
         free = [0, 1, 2, 5, 6] if self.tilt_sigma_rad == 0.0 else [0, 1, 2, 3, 4, 5, 6]
         rows = np.concatenate((columns[:, free], linear), axis=1)
         total = float(weight.sum())
@@ -314,7 +321,7 @@ class _Model:
             full = np.zeros(7)
             full[equations.free] = equations.change
             size = max(
-                float(np.hypot(full[0], full[1])) / self.unit,
+                float(np.hypot(*_move(state.centre, full))) / self.unit,
                 abs(full[2]) * self.edges_m[0] / self.unit,
                 abs(full[5]),
                 2.0 * abs(full[6]),
@@ -324,7 +331,7 @@ class _Model:
             state.centre = state.centre + full[:2]
             state.kappa += full[2]
             state.growth_px += full[5]
-            state.blur_px = float(np.clip(state.blur_px * np.exp(full[6]), 0.25, 4.0))
+            state.blur_px = float(np.clip(state.blur_px * np.exp(full[6]), 0.3, 4.0))
             if self.tilt_sigma_rad > 0.0:
                 state.tilt = state.tilt + full[3:5]
                 state.plane = state.plane.tilted(rotation_xy(full[3], full[4]))
@@ -333,6 +340,16 @@ class _Model:
             if size < tolerance:
                 break
         return equations
+
+
+def _move(centre: Array, change: Array) -> tuple[float, float]:
+    """Return how far the target moves in the image's plane: a tilt alone carries the plane's points along."""
+    x, y = centre
+    alpha, beta = change[3], change[4]
+    return (
+        float(change[0] + x * y * alpha - (1.0 + x * x) * beta),
+        float(change[1] + (1.0 + y * y) * alpha - x * y * beta),
+    )
 
 
 def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patch: _Patch) -> Fit:
@@ -349,7 +366,7 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
     variance = max(solved.mean_square * total / max(total - solved.rows.shape[1], 1.0), 0.08)
     rw = solved.rows * solved.weight[:, None]
     shift = -(solved.inverse / variance) @ (rw.T @ solved.considered)
-    considered = np.zeros((5, 3))
+    considered = np.zeros((5, 4))
     considered[rows] = shift[at]
     agrees = np.abs(solved.residual) < max(3.5 * np.sqrt(variance), 0.12 * solved.contrast)
     v = patch.v[solved.used]
@@ -375,6 +392,7 @@ def _result(state: _State, solved: _Equations, gain: float, edges_m: Array, patc
         tuple(range(len(edges_m))),
         state.blur_px,
         state.growth_px,
+        float(np.sqrt(solved.inverse[free.index(5), free.index(5)])),
         gain,
         int(agrees.sum()),
         len(edges_m),

@@ -55,12 +55,15 @@ from vision.lines import (
     neighbours,
 )
 from vision.profile import (
-    INV_SQRT_2PI,
+    FAR_PX,
+    box_across,
+    edge_profile,
+    gaussian_part,
     line_blur,
     line_displacement,
     line_solution,
     line_solution_sharp,
-    phi,
+    motion_of,
 )
 from vision.refine import Solution, is_contrary, solve_profiles
 from vision.rings import MIN_POINTS, is_around, is_match, kasa_centre, label_circles
@@ -278,56 +281,65 @@ def _lay_lines(
             c = line_considered(view, gu, gv, xm, ym, per)
             for k in range(3):
                 row[CONSIDERED + k] = c[k]
+            row[CONSIDERED + 3] = 1.0
             row[NU], row[NV] = c[1], c[2]
         return Lines(out.pixels[:n], out.edge[:n], out.row[:n])
 
     return lay
 
 
+@overload(profile.line_boxes)
+def _line_boxes(lines: Lines, blur: Array, blur_xy: Array) -> Callable[..., Array]:
+    def boxes(lines: Lines, blur: Array, blur_xy: Array) -> Array:
+        motion = motion_of(blur_xy)
+        out = np.empty(len(blur))
+        for i in range(len(blur)):
+            out[i] = box_across(motion, lines.row[i, NU], lines.row[i, NV], blur[i])
+        return out
+
+    return boxes
+
+
 @overload(profile.line_moments)
 def _line_moments(
-    lines: Lines, shift_px: Array, growth_px: float, blur: Array, with_neighbours: bool
+    lines: Lines, shift_px: Array, growth_px: float, blur: Array, box: Array, with_neighbours: bool
 ) -> Callable[..., Array]:
-    def moments(lines: Lines, shift_px: Array, growth_px: float, blur: Array, with_neighbours: bool) -> Array:
+    def moments(
+        lines: Lines, shift_px: Array, growth_px: float, blur: Array, box: Array, with_neighbours: bool
+    ) -> Array:
         p, m = lines.pixels.shape[:2]
-        gram = np.empty((p, 4, 4))
-        column = np.empty(4)
+        gram = np.zeros((p, 4, 4))
+        column, sums = np.empty(4), np.empty(4)
         for i in range(p):
             row, pixels = lines.row[i], lines.pixels[i]
-            s, b = row[SIDE], blur[i]
-            per = 1.0 / b
-            moved = shift_px[i] - b * b * row[BEND]
-            grown = 2.0 * growth_px * s - b * b * row[BEND]
-            outer = grown - row[OUTWARD_PX] + b * b * row[OUTWARD_BEND]
-            inner = grown + row[INWARD_PX] + b * b * row[INWARD_BEND]
-            sums = np.zeros(4)
-            for k in range(4):
-                for l in range(4):
-                    gram[i, k, l] = 0.0
+            s, square = row[SIDE], blur[i] * blur[i]
+            sigma = gaussian_part(blur[i], box[i])
+            moved = shift_px[i] - square * row[BEND]
+            grown = 2.0 * growth_px * s - square * row[BEND]
+            outer = grown - row[OUTWARD_PX] + square * row[OUTWARD_BEND]
+            inner = grown + row[INWARD_PX] + square * row[INWARD_BEND]
+            sums[:] = 0.0
             for j in range(m):
                 if pixels[j, WEIGHT] == 0.0:
                     continue
                 distance = pixels[j, DISTANCE] - moved
-                t = distance * per
-                bell = math.exp(-0.5 * t * t)
-                rise = phi(t)
-                spread = t * bell
+                rise, slope, wider = edge_profile(distance, sigma, box[i])
                 if with_neighbours:
                     for offset in (outer, inner):
-                        tj = min(max((distance + offset) * per, -9.0), 9.0)
-                        bj = math.exp(-0.5 * tj * tj)
-                        rise -= phi(tj)
-                        bell -= bj
-                        spread -= tj * bj
+                        away = min(max(distance + offset, -FAR_PX), FAR_PX)
+                        r, d, w = edge_profile(away, sigma, box[i])
+                        rise -= r
+                        slope -= d
+                        wider -= w
                 column[0] = s * rise
-                column[1] = -INV_SQRT_2PI * s * per * bell
-                column[2] = -INV_SQRT_2PI * s * spread
+                column[1] = -s * slope
+                column[2] = s * square / sigma * wider
                 column[3] = pixels[j, VALUE] - row[LEVEL]
                 for k in range(4):
                     sums[k] += column[k]
                     for l in range(k + 1):
                         gram[i, k, l] += column[k] * column[l]
-            total = max(lines.row[i, TOTAL], 1.0)
+            total = max(row[TOTAL], 1.0)
             for k in range(4):
                 for l in range(k + 1):
                     gram[i, k, l] -= sums[k] * sums[l] / total
@@ -617,7 +629,8 @@ def _agreement(
 _REPLACED: set[object] = {
     view.whole, view.either, robust.masked, robust.median, robust.times, robust.normal_equations, robust.inverted,
     robust.reweighted,
-    lines.lay_lines, profile.line_moments, profile.solve_lines, profile.displacements, profile.line_blurs,
+    lines.lay_lines, profile.line_moments, profile.line_boxes, profile.solve_lines, profile.displacements,
+    profile.line_blurs,
     profile.crowded, rings.contour_sums, rings.match_trials, refine.counted, refine.rms, refine.agreement,
     solve_profiles, label_circles,
 }  # fmt: skip
@@ -666,6 +679,6 @@ def compile_now() -> None:
     camera = Camera(16, 16, 10.0, 10.0)
     level = plane.LevelPlane(camera, np.eye(3)).view
     edges = lines.edges_of(np.array([2.0, 1.0]))
-    solve(np.zeros((16, 16, 3), dtype=np.uint8), level, np.zeros(2), 0.1, np.zeros(2), edges, 0.0, 54)
+    solve(np.zeros((16, 16, 3), dtype=np.uint8), level, np.zeros(2), 0.1, np.zeros(2), edges, 0.0, 8)
     u = np.arange(8.0)
     label(level, u, u, np.array([0, 8]), np.zeros(1, dtype=np.bool_), 2.0, edges.radius_m, 4)

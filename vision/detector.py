@@ -46,8 +46,12 @@ MIN_DIAMETER_PX = 7.0
 """Outer diameter below which nothing can be told from a red spot."""
 SMALL_PX = 80.0
 """Outer diameter below which all pixels of the target are fitted where its edges could not be."""
+SHARP_BLUR_PX = 0.7
 BLUR_ERROR = 0.04
-"""Error of an edge's place that all edges share, per pixel of blur beyond that of a sharp picture."""
+"""Error of an edge's place that all edges share, per pixel of blur beyond that of a sharp picture, where blurred
+edges reach their neighbours."""
+GROWTH_ERROR = 0.06
+"""The same per pixel of growth beyond what noise explains: it is taken as equal for all edges, and is not quite."""
 MAX_FITS = 16
 MAX_AREA_FITS = 6
 """Limits of the work spent on one image."""
@@ -98,7 +102,7 @@ class TargetDetector:
         deck_tilt_sigma_rad: float = 0.0,
         focal_sigma: float = 0.0,
         principal_point_sigma_px: float = 0.0,
-        model_error_px: float = 0.003,
+        model_error_px: float = 0.001,
         R_cb: ArrayLike = R_CB_NOMINAL,
         min_share: float = 0.55,
         engine: str = "auto",
@@ -417,18 +421,18 @@ class TargetDetector:
         jacobian[:, 2] = -position / kappa
         jacobian[:, 3:] = (back @ skew(ray))[:, :2] / kappa
         unit = float(plane.units_per_pixel(fit.centre[0], fit.centre[1]))
-        radius_px = kappa * self._edges[min(fit.edges)] / unit
-        # The edge's profile is taken as Gaussian, which matters the more the wider it is.
-        error_px = math.hypot(self.model_error_px, BLUR_ERROR * max(0.0, fit.blur_px - 0.9))
+        # The wider an edge and the nearer its neighbours, the more the shape of its profile matters.
+        gap_px = float(self._edge_table.near_m[list(fit.edges)].min()) * kappa / unit
+        crowding = min(1.0, 6.0 * fit.blur_px / gap_px)
+        blur_error = BLUR_ERROR * max(0.0, fit.blur_px - SHARP_BLUR_PX) * crowding
+        growth = math.sqrt(max(0.0, fit.growth_px**2 - fit.growth_sigma_px**2))
+        outward = math.hypot(self.model_error_px, blur_error, GROWTH_ERROR * growth)
         inner = fit.covariance.copy()
-        inner[0, 0] += (error_px * unit) ** 2
-        inner[1, 1] += (error_px * unit) ** 2
-        inner[2, 2] += (error_px * kappa / radius_px) ** 2
-        covariance = jacobian @ inner @ jacobian.T
-        if self.focal_sigma > 0.0 or self.principal_point_sigma_px > 0.0:
-            sigmas = (self.focal_sigma, self.principal_point_sigma_px, self.principal_point_sigma_px)
-            shifts = jacobian @ fit.considered * sigmas
-            covariance += shifts @ shifts.T
+        inner[0, 0] += (self.model_error_px * unit) ** 2
+        inner[1, 1] += (self.model_error_px * unit) ** 2
+        sigmas = (self.focal_sigma, self.principal_point_sigma_px, self.principal_point_sigma_px, outward)
+        shifts = fit.considered * sigmas
+        covariance = jacobian @ (inner + shifts @ shifts.T) @ jacobian.T
         if known_attitude and self.attitude_sigma_rad > 0.0:
             turn = skew(position)
             covariance += self.attitude_sigma_rad**2 * (turn @ turn.T)

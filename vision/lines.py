@@ -77,9 +77,9 @@ class Lines(NamedTuple):
 
     ``pixels`` (p, m, 4): DISTANCE of each pixel outward from the edge as predicted [px], its VALUE
     (brightness), its RED, and its WEIGHT, zero for repeated and missing pixels. ``edge`` (p,) the edge's index.
-    ``row`` (p, 23): the columns named below; DESIGN begins the change of the edge's displacement with the
-    centre x, y, kappa, tilt x, y and the growth of red [px], CONSIDERED that with the relative focal length and
-    the principal point [px].
+    ``row`` (p, 24): the columns named below; DESIGN begins the change of the edge's displacement with the
+    centre x, y, kappa, tilt x, y and the growth of red [px], CONSIDERED that with the relative focal length, the
+    principal point and an outward move of all edges [px].
     """
 
     pixels: Array
@@ -100,7 +100,7 @@ OUTWARD_PX, INWARD_PX, OUTWARD_BEND, INWARD_BEND = 6, 7, 8, 9
 """Distances to the neighbouring edges (infinite where there is none) and their bend."""
 U0, V0, NU, NV = 10, 11, 12, 13
 """Place of the edge and its normal in the image."""
-DESIGN, CONSIDERED, COLUMNS = 14, 20, 23
+DESIGN, CONSIDERED, COLUMNS = 14, 20, 24
 
 
 def empty_lines(n: int) -> Lines:
@@ -196,6 +196,7 @@ def lay_lines(
         row[:, DESIGN + k] = column
     for k, column in enumerate(line_considered(view, gu, gv, xm, ym, per)):
         row[:, CONSIDERED + k] = column
+    row[:, CONSIDERED + 3] = 1.0
     outward, inward = neighbours(edges)
     scale = kappa * per
     row[:, SIDE], row[:, HALF_PX], row[:, GAP_PX] = side, half, gap

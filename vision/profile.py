@@ -25,6 +25,7 @@ from vision.lines import (
     NV,
     OUTWARD_BEND,
     OUTWARD_PX,
+    SAMPLES,
     SIDE,
     TOTAL,
     VALUE,
@@ -42,6 +43,12 @@ MIN_CONTRAST = 4.0
 """Least brightness across an edge."""
 MIN_VARIANCE = 0.08
 """Variance of the rounding to whole numbers, the least noise of a pixel."""
+MIN_GAUSSIAN_PX = 0.25
+"""Least blur of a lens."""
+MAX_BOX = 3.3
+"""Widest box as a share of the whole blur; a box alone has 3.46."""
+FAR_PX = 40.0
+"""Distance from an edge beyond which nothing changes."""
 DIRECTIONAL_PX = 0.85
 """Blur from which its direction is sought."""
 
@@ -76,49 +83,95 @@ def line_blurs(lines: Lines, blur_xy: Array) -> Array:
     return blur
 
 
+def line_boxes(lines: Lines, blur: Array, blur_xy: Array) -> Array:
+    """Return the box of each line's blur (p,) [px]: the longer of a pixel's width and of the motion across."""
+    motion = motion_of(blur_xy)
+    nu, nv = lines.row[:, NU], lines.row[:, NV]
+    box: Array = box_across(motion, nu, nv, blur)
+    return box
+
+
+def box_across(motion: Array, nu: Any, nv: Any, blur: Any) -> Any:
+    """Return the longer of a pixel's width and of a motion (2,) along the normal (nu, nv), within the blur."""
+    moved = np.minimum(np.abs(nu * motion[0] + nv * motion[1]), MAX_BOX * blur)
+    return np.maximum(pixel_box(nu, nv), moved)
+
+
 def crowded(lines: Lines, blur: Array) -> bool:
     """Return whether neighbouring edges reach into some of the lines."""
     return bool((lines.row[:, GAP_PX] - lines.row[:, HALF_PX] < 3.0 * blur).any())
 
 
+def edge_profile(distance: Any, sigma: Any, box: Any) -> tuple[Any, Any, Any]:
+    """Return an edge's brightness from 0 to 1 at a distance [px], and its derivatives with distance and sigma.
+
+    The step is blurred by a Gaussian of 1-sigma ``sigma`` and by a box of width ``box``, both in pixels: the lens,
+    and what is straight, a pixel's width or the path of a motion.
+    """
+    p, m = (distance + 0.5 * box) / sigma, (distance - 0.5 * box) / sigma
+    bell_p, bell_m = INV_SQRT_2PI * np.exp(-0.5 * p * p), INV_SQRT_2PI * np.exp(-0.5 * m * m)
+    cdf_p, cdf_m = phi(p), phi(m)
+    wider = (bell_p - bell_m) / box
+    return sigma * ((p * cdf_p - m * cdf_m) / box + wider), (cdf_p - cdf_m) / box, wider
+
+
+def pixel_box(nu: Any, nv: Any) -> Any:
+    """Return the width of a pixel along the normal (nu, nv) of an edge [px]: the longer of its two shadows."""
+    return np.maximum(np.abs(nu), np.abs(nv))
+
+
+def motion_of(blur_xy: Array) -> Array:
+    """Return the vector (2,) of the straight motion [px] that explains why a blur differs with the direction.
+
+    A blur's covariance (uu, uv, vv), with uv the sum of both off-diagonal elements, has the excess L^2 / 12 along a
+    path of length L.
+    """
+    difference, mixed = blur_xy[0] - blur_xy[2], blur_xy[1]
+    excess = np.hypot(difference, mixed)
+    angle = 0.5 * np.arctan2(mixed, difference)
+    length = np.sqrt(12.0 * excess)
+    return np.array([length * np.cos(angle), length * np.sin(angle)])
+
+
+def gaussian_part(blur: Any, box: Any) -> Any:
+    """Return the 1-sigma of the Gaussian that is left of a blur [px] beside a box."""
+    return np.sqrt(np.maximum(blur * blur - box * box / 12.0, MIN_GAUSSIAN_PX**2))
+
+
 def line_moments(
-    lines: Lines, shift_px: Array, growth_px: float, blur: Array, with_neighbours: bool
+    lines: Lines, shift_px: Array, growth_px: float, blur: Array, box: Array, with_neighbours: bool
 ) -> Array:
     """Return the moments (p, 4, 4) of three columns and the brightness about their means on each line.
 
     The columns are the derivatives of the brightness, over the contrast, with the contrast, the displacement
-    and the logarithm of the blur, at ``shift_px`` (p,) from the prediction and with ``blur`` (p,).
+    and the logarithm of the blur, at ``shift_px`` (p,) from the prediction, with ``blur`` and its ``box`` (p,).
     """
     row, value, weight = lines.row, lines.pixels[:, :, VALUE], lines.pixels[:, :, WEIGHT]
     s = row[:, SIDE]
-    per = (1.0 / blur)[:, None]
-    distance = lines.pixels[:, :, DISTANCE] - (shift_px - blur * blur * row[:, BEND])[:, None]
-    t = distance * per
-    bell = np.exp(-0.5 * t * t)
-    rise = phi(t)
-    spread = t * bell
+    square = blur * blur
+    sigma = gaussian_part(blur, box)
+    distance = lines.pixels[:, :, DISTANCE] - (shift_px - square * row[:, BEND])[:, None]
+    rise, slope, wider = edge_profile(distance, sigma[:, None], box[:, None])
     if with_neighbours:
         # The neighbours grow the other way, and bend by their own radius.
-        grown = (2.0 * growth_px) * s - blur * blur * row[:, BEND]
+        grown = (2.0 * growth_px) * s - square * row[:, BEND]
         for offset in (
-            grown - row[:, OUTWARD_PX] + blur * blur * row[:, OUTWARD_BEND],
-            grown + row[:, INWARD_PX] + blur * blur * row[:, INWARD_BEND],
+            grown - row[:, OUTWARD_PX] + square * row[:, OUTWARD_BEND],
+            grown + row[:, INWARD_PX] + square * row[:, INWARD_BEND],
         ):
-            tj = np.minimum(np.maximum((distance + offset[:, None]) * per, -9.0), 9.0)
-            bj = np.exp(-0.5 * tj * tj)
-            rise = rise - phi(tj)
-            bell = bell - bj
-            spread = spread - tj * bj
-    basis = np.empty((len(s), 4, t.shape[1]))
+            away = np.minimum(np.maximum(distance + offset[:, None], -FAR_PX), FAR_PX)
+            r, l, w = edge_profile(away, sigma[:, None], box[:, None])
+            rise, slope, wider = rise - r, slope - l, wider - w
+    basis = np.empty((len(s), 4, SAMPLES))
     np.multiply(s[:, None], rise, out=basis[:, 0])
-    np.multiply((-INV_SQRT_2PI * s)[:, None] * per, bell, out=basis[:, 1])
-    np.multiply((-INV_SQRT_2PI * s)[:, None], spread, out=basis[:, 2])
+    np.multiply(-s[:, None], slope, out=basis[:, 1])
+    np.multiply((s * square / sigma)[:, None], wider, out=basis[:, 2])
     basis[:, 3] = value - row[:, LEVEL, None]
     weighted = basis * weight[:, None, :]
     # About the means of each line: its level is eliminated.
     sums = weighted.sum(axis=2)
     gram = weighted @ basis.transpose(0, 2, 1)
-    gram -= (sums / np.maximum(lines.row[:, TOTAL], 1.0)[:, None])[:, :, None] * sums[:, None, :]
+    gram -= (sums / np.maximum(row[:, TOTAL], 1.0)[:, None])[:, :, None] * sums[:, None, :]
     return gram
 
 

@@ -40,7 +40,7 @@ from vision.lines import (
     lay_lines,
 )
 from vision.plane import LevelPlane, rotation_xy
-from vision.profile import crowded, line_blurs, line_moments, measure, updated_blur
+from vision.profile import crowded, line_blurs, line_boxes, line_moments, measure, updated_blur
 from vision.robust import Solved, least_squares, median, normal_equations, times
 from vision.view import View, turned
 
@@ -52,7 +52,7 @@ GROWTH_SIGMA_PX = 0.3
 START_BLUR_PX = 0.65
 CLOSE_PX = 0.12
 """Displacements below this are linear enough to need no second step."""
-N_LINES = 54
+N_LINES = 64
 """About how many lines are laid over all edges."""
 
 
@@ -62,11 +62,13 @@ class Fit:
 
     ``plane`` is the plane that was fitted, tilted where the tilt was free; ``centre`` (2,), ``kappa`` [1/m];
     ``tilt`` (2,) rotation vector about the level x and y axes [rad]; ``covariance`` that
-    of (centre x, y, kappa, tilt x, y), shape (5, 5), zero rows for a fixed tilt; ``considered`` (5, 3) the
-    change of those per relative error of the focal length and per pixel of the principal point;
+    of (centre x, y, kappa, tilt x, y), shape (5, 5), zero rows for a fixed tilt; ``considered`` (5, 4) the
+    change of those per relative error of the focal length, per pixel of the principal point, and per pixel by
+    which all edges lie further out than the model says;
     ``residual_px`` the root-mean-square displacement of the edges; ``share`` of the visible edge length
     that agrees with the model; ``edges`` that were seen, of ``n_visible`` that should be; ``chi2`` the mean
     weighted square of the displacements (of an area fit: how many times worse a plain disc fits);
+    ``growth_sigma_px`` how well the growth is known;
     ``points_px`` (n, 2) what was compared, and whether it ``agrees``. ``red_slope`` is the change of R per
     change of (G + B) / 2: about zero or positive between red and white, about -1 between red and blue.
     ``contradicted`` is the share of the places where an edge should be and plain white or red is, or (of an
@@ -84,6 +86,7 @@ class Fit:
     edges: tuple[int, ...]
     blur_px: float
     growth_px: float
+    growth_sigma_px: float
     chi2: float
     count: int
     n_visible: int
@@ -112,6 +115,7 @@ class Solution(NamedTuple):
     seen: NDArray[np.bool_]
     blur_px: float
     growth_px: float
+    growth_sigma_px: float
     chi2: float
     n_inlier: int
     n_visible: int
@@ -160,6 +164,7 @@ def fit_profiles(
         tuple(np.flatnonzero(s.seen).tolist()),
         s.blur_px,
         s.growth_px,
+        s.growth_sigma_px,
         s.chi2,
         s.n_inlier,
         s.n_visible,
@@ -245,7 +250,8 @@ def _fit_lines(
     for i in range(5):
         shift = times(a, total)
         blur = line_blurs(lines, blur_xy)
-        gram = line_moments(lines, shift, total[n - 1], blur, crowded(lines, blur))
+        box = line_boxes(lines, blur, blur_xy)
+        gram = line_moments(lines, shift, total[n - 1], blur, box, crowded(lines, blur))
         measured = measure(lines, gram, i < 4)
         pull = precision * (base - start - total)
         solved = least_squares(a, measured.delta, measured.sigma2, measured.valid, precision, pull)
@@ -282,8 +288,8 @@ def _result(
     n = len(free)
     a = lines.row[:, DESIGN + free]
     solved = step.solved
-    covariance, considered = np.zeros((5, 5)), np.zeros((5, 3))
-    for k in range(3):
+    covariance, considered = np.zeros((5, 5)), np.zeros((5, 4))
+    for k in range(4):
         _, pulled = normal_equations(a, solved.weight, lines.row[:, CONSIDERED + k])
         shift = times(solved.inverse, pulled)
         for i in range(n - 1):
@@ -308,6 +314,7 @@ def _result(
         agreeing > 0.4 * laid,
         blur_px,
         growth_px,
+        np.sqrt(solved.inverse[n - 1, n - 1] * solved.chi2),
         solved.chi2,
         int(np.count_nonzero(inlier)),
         int(np.count_nonzero(laid)),
@@ -363,5 +370,5 @@ def _no_solution() -> Solution:
     nothing, none = np.zeros((0, 0)), np.zeros(0)
     return Solution(
         False, nothing, none, 0.0, none, nothing, nothing, 0.0, 0.0, np.zeros(0, dtype=np.bool_),
-        0.0, 0.0, 0.0, 0, 0, nothing, np.zeros(0, dtype=np.bool_), 0.0, 0.0,
+        0.0, 0.0, 0.0, 0.0, 0, 0, nothing, np.zeros(0, dtype=np.bool_), 0.0, 0.0,
     )  # fmt: skip
