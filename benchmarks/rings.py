@@ -1,6 +1,6 @@
 """The detector against ArUco and AprilTag on one renderer: accuracy, consistency, robustness, time.
 
-    python benchmarks/rings.py [--full] [--frames N] [--only accuracy,nees,robust,false,time] [--json FILE]
+    python benchmarks/rings.py [--full] [--frames N] [--only accuracy,nees,second,robust,false,time] [--json FILE]
 
 Camera 640x480, 62.2 deg. Targets and markers 1.0 m (a marker's black border), on a white board; camera
 calibrated, attitude known. Roll and pitch uniform in +-25 deg, any yaw, anywhere in the frame; at 1 m
@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 from marker_renderer import MarkerRenderer, marker_bits
 from numpy.typing import NDArray
+from raycast import Look, Raycast
 from targets import Target, Targets, provenance
 
 from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_exp, quat_to_matrix
@@ -263,6 +264,43 @@ def consistency(frames: int, targets: Targets) -> dict[str, Any]:
     return rows
 
 
+LOOKS = {
+    "second renderer": Look(),
+    "second renderer, no lens blur": Look(spread_px=0.0),
+    "second renderer, clipped white": Look(light=1.5),
+    "second renderer, gamma 2.2": Look(gamma=2.2),
+    "second renderer, motion 4 px": Look(motion_px=4.0, motion_angle_rad=0.6),
+}
+
+
+def second_renderer(frames: int, targets: Targets) -> dict[str, Any]:
+    """Errors and NEES on pictures of a renderer that shares nothing with the first (``raycast``)."""
+    rows: dict[str, Any] = {}
+    print(f"\nsecond renderer, {frames} frames each: detection, Z rms in % of Z, NEES")
+    for name, target in TARGETS.items():
+        renderer, detector = Raycast(CAMERA, target), TargetDetector(CAMERA, target)
+        for case, look in LOOKS.items():
+            for height in (5.0, 10.0, 20.0, 34.0):
+                rng = np.random.default_rng(int(100 * height) + 4)
+                truths, found, nees = [], [], []
+                for R_nc, truth in poses(rng, height, frames):
+                    result = detector.detect(renderer.render(R_nc, truth, rng, look), R_nc)
+                    truths.append(truth)
+                    found.append(position(result))
+                    if isinstance(result, VisionFix):
+                        nees.append(normalised(result, truth))
+                cell = summary(truths, found) | {"nees": float(np.mean(nees)) if nees else None}
+                rows[f"{name}, {case}, {height:g} m"] = cell
+                print(
+                    f"{name:20} {case:32} {height:4g} m  {100 * cell['detected']:4.0f} %  "
+                    f"{cell['z_percent'].get('rms', math.nan):.4f} %  NEES {cell['nees'] or math.nan:.2f}"
+                )
+                clean = case == "second renderer"
+                bound = band(len(nees))[1] if clean and nees else 3.5
+                targets.add(Target(f"NEES {name}, {case}, {height:g} m", cell["nees"], bound))
+    return rows
+
+
 def _bar(rng: np.random.Generator) -> Conditions:
     return replace(NOISE, bar_px=1.0, bar_offset=rng.uniform(-0.7, 0.7), bar_angle_rad=rng.uniform(0.0, 3.14))
 
@@ -402,7 +440,7 @@ def main() -> int:
     )
     parser.add_argument("--full", action="store_true", help="200 frames a cell, 1000 cluttered frames")
     parser.add_argument("--frames", type=int, default=None, help="frames a cell (default 25)")
-    parser.add_argument("--only", default="accuracy,nees,robust,false,time", help="parts to run")
+    parser.add_argument("--only", default="accuracy,nees,second,robust,false,time", help="parts to run")
     parser.add_argument("--json", metavar="FILE", help="write the results")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
@@ -411,6 +449,7 @@ def main() -> int:
         "time": lambda t: times(min(frames, 20), t),
         "accuracy": lambda t: accuracy(frames, t),
         "nees": lambda t: consistency(frames, t),
+        "second": lambda t: second_renderer(max(frames // 2, 10), t),
         "robust": lambda t: robustness(frames, t),
         "false": lambda t: false_fixes(1000 if arguments.full else 4 * frames, t),
     }

@@ -22,6 +22,8 @@ from vision import lens, lines, plane, profile, refine, rings, robust, view
 from vision.camera import Camera
 from vision.lines import (
     BEND,
+    CLIPPED,
+    CLIPPED_LEVEL,
     CONSIDERED,
     DESIGN,
     DISTANCE,
@@ -248,7 +250,7 @@ def _lay_lines(
             gu, gv = plane_gradient(view, cos, sin, qxm, qym, xm, ym)
             slope = math.hypot(gu, gv)
             per = 1.0 / slope
-            total, level = 0.0, 0.0
+            total, level, clipped = 0.0, 0.0, 0.0
             before_u, before_v = -1e9, -1e9
             for m in range(SAMPLES):
                 reach = half / length * (2.0 * m / (SAMPLES - 1) - 1.0)
@@ -260,6 +262,8 @@ def _lay_lines(
                     ui, vi = min(max(ui, 0.0), w), min(max(vi, 0.0), h)
                 at = image[int(vi), int(ui)]
                 value = 0.5 * (float(at[0]) + float(at[1]))
+                if at[0] >= CLIPPED_LEVEL or at[1] >= CLIPPED_LEVEL:
+                    clipped = 1.0
                 total += weight
                 level += weight * value
                 x, y = pixel_rays(view, ui, vi)
@@ -282,6 +286,7 @@ def _lay_lines(
             for k in range(3):
                 row[CONSIDERED + k] = c[k]
             row[CONSIDERED + 3] = 1.0
+            row[CLIPPED] = clipped
             row[NU], row[NV] = c[1], c[2]
         return Lines(out.pixels[:n], out.edge[:n], out.row[:n])
 
@@ -571,19 +576,6 @@ def _counted(edge: Int, inlier: Bool, n_edges: int) -> Callable[..., tuple[Array
     return count
 
 
-@overload(refine.rms)
-def _rms(residual: Array, used: Bool) -> Callable[..., float]:
-    def root(residual: Array, used: Bool) -> float:
-        total, n = 0.0, 0
-        for i in range(len(residual)):
-            if used[i]:
-                total += residual[i] * residual[i]
-                n += 1
-        return math.sqrt(total / n) if n else math.inf
-
-    return root
-
-
 @overload(refine.agreement)
 def _agreement(
     lines: Lines, edges: Edges, laid: Array, inlier: Bool, contrast: float
@@ -631,7 +623,7 @@ _REPLACED: set[object] = {
     robust.reweighted,
     lines.lay_lines, profile.line_moments, profile.line_boxes, profile.solve_lines, profile.displacements,
     profile.line_blurs,
-    profile.crowded, rings.contour_sums, rings.match_trials, refine.counted, refine.rms, refine.agreement,
+    profile.crowded, rings.contour_sums, rings.match_trials, refine.counted, refine.agreement,
     solve_profiles, label_circles,
 }  # fmt: skip
 for _module in _MODULES:

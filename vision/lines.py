@@ -35,6 +35,8 @@ MIN_RADIUS_PX = 3.5
 HALF_LENGTH_PX = 3.2
 MIN_HALF_LENGTH_PX = 2.6
 MIN_LINES = 12
+CLIPPED_LEVEL = 253
+"""Brightness from which a pixel says only that it was brighter."""
 STEP = 0.002
 """Size of the second circle that shows the direction of the radius, relative to the outermost edge."""
 
@@ -77,7 +79,7 @@ class Lines(NamedTuple):
 
     ``pixels`` (p, m, 4): DISTANCE of each pixel outward from the edge as predicted [px], its VALUE
     (brightness), its RED, and its WEIGHT, zero for repeated and missing pixels. ``edge`` (p,) the edge's index.
-    ``row`` (p, 24): the columns named below; DESIGN begins the change of the edge's displacement with the
+    ``row`` (p, 25): the columns named below; DESIGN begins the change of the edge's displacement with the
     centre x, y, kappa, tilt x, y and the growth of red [px], CONSIDERED that with the relative focal length, the
     principal point and an outward move of all edges [px].
     """
@@ -100,7 +102,9 @@ OUTWARD_PX, INWARD_PX, OUTWARD_BEND, INWARD_BEND = 6, 7, 8, 9
 """Distances to the neighbouring edges (infinite where there is none) and their bend."""
 U0, V0, NU, NV = 10, 11, 12, 13
 """Place of the edge and its normal in the image."""
-DESIGN, CONSIDERED, COLUMNS = 14, 20, 24
+DESIGN, CONSIDERED = 14, 20
+CLIPPED, COLUMNS = 24, 25
+"""One where some pixel of the line is as bright as can be, else zero."""
 
 
 def empty_lines(n: int) -> Lines:
@@ -177,6 +181,7 @@ def lay_lines(
     pixels[:, :, VALUE], pixels[:, :, RED], pixels[:, :, WEIGHT] = value, colour[..., 2], weight
     total = weight.sum(axis=1)
     row[:, TOTAL] = total
+    row[:, CLIPPED] = (colour[..., :2] >= CLIPPED_LEVEL).any(axis=(1, 2))
     row[:, LEVEL] = (value * weight).sum(axis=1) / np.maximum(total, 1.0)
 
     x, y = pixel_rays(view, ui, vi)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vision.lines import (
     BEND,
+    CLIPPED,
     DISTANCE,
     GAP_PX,
     HALF_PX,
@@ -43,6 +44,9 @@ MIN_CONTRAST = 4.0
 """Least brightness across an edge."""
 MIN_VARIANCE = 0.08
 """Variance of the rounding to whole numbers, the least noise of a pixel."""
+CLIPPED_ERROR_PX = 0.3
+"""Error of the place of an edge on a line with clipped pixels, where others have none."""
+ENOUGH_UNCLIPPED = 9
 MIN_GAUSSIAN_PX = 0.25
 """Least blur of a lens."""
 MAX_BOX = 3.3
@@ -277,6 +281,10 @@ def measure(lines: Lines, gram: Array, free_blur: bool) -> Measured:
     middle = median(contrast)
     noise = max(median(line_noise(rest, lines.row[:, TOTAL])), MIN_VARIANCE)
     delta, sigma2, valid = displacements(lines, gram, contrast, shift, inverse, rest, middle, noise)
+    clipped = lines.row[:, CLIPPED]
+    if ((1.0 - clipped) * valid).sum() >= ENOUGH_UNCLIPPED:
+        # Glare moves single edges; where nearly all are clipped they grow alike.
+        sigma2 = sigma2 + CLIPPED_ERROR_PX**2 * clipped
     ok = middle > MIN_CONTRAST and bool(np.count_nonzero(valid) >= 10)
     return Measured(ok, delta, sigma2, valid, wider / np.maximum(contrast, 1.0), middle)
 

@@ -309,7 +309,7 @@ def _result(
         tilt,
         covariance,
         considered,
-        rms(solved.residual, inlier),
+        rms(solved.residual, solved.weight, inlier),
         share,
         agreeing > 0.4 * laid,
         blur_px,
@@ -333,10 +333,11 @@ def counted(edge: NDArray[np.int64], inlier: NDArray[np.bool_], n_edges: int) ->
     )
 
 
-def rms(residual: Array, used: NDArray[np.bool_]) -> float:
-    """Return the root mean square of the residuals in use."""
-    misses = residual[used]
-    return float(np.sqrt((misses @ misses) / len(misses))) if len(misses) else np.inf
+def rms(residual: Array, weight: Array, used: NDArray[np.bool_]) -> float:
+    """Return the weighted root mean square of the residuals in use."""
+    w, misses = weight[used], residual[used]
+    total = w.sum()
+    return float(np.sqrt((w * misses * misses).sum() / total)) if total > 0.0 else np.inf
 
 
 def agreement(
