@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from deckfix.commands import digest, write_text
 from deckfix.files import check_output, output_file, output_folder
 from deckfix.terminal import working
+from estimation.config import ConfigError
+
+if TYPE_CHECKING:
+    from logs.recording import Recording
 
 DEMO_SCENARIO = "landing_2026_06"
 
@@ -16,20 +21,44 @@ def simulate_flight(
 ) -> str:
     """Write the log of a simulated flight, and return what there is to say.
 
-    ``scenario`` is the name of one that comes with the product, or the path of a TOML file. Raises
-    ``estimation.config.ConfigError`` for the scenario, ``deckfix.files.OutputError`` for the output.
+    ``scenario`` is the name of a scenario or of a mission (flown in a closed loop) that comes with the product, or the
+    path of a TOML file of either kind. Raises ``estimation.config.ConfigError`` for the scenario,
+    ``deckfix.files.OutputError`` for the output.
     """
     from logs.writer import FlightWriter
-    from simulation.flight import load_scenario, simulate
 
     inputs = [scenario] if scenario.endswith(".toml") else []
     with output_file(output, force=force, inputs=inputs) as partial:
         with working(f"simulating {scenario}"):
-            flight = simulate(load_scenario(scenario), seed)
-            recording = flight.recording()
+            recording, said = _simulated(scenario, seed)
         with working(f"writing {Path(output).name}"), FlightWriter(partial, force=True) as writer:
             writer.write_recording(recording)
-    return f"wrote {output}: {flight.scenario.description} ({len(flight.batch):,} events, seed {flight.seed})"
+    return f"wrote {output}: {said}"
+
+
+def _simulated(scenario: str, seed: int | None) -> tuple[Recording, str]:
+    """Simulate a scenario or fly a mission; return the recording and what there is to say of it."""
+    from simulation.flight import load_scenario, scenario_names, simulate
+    from simulation.mission import is_mission, load_mission, mission_names
+
+    if not is_mission(scenario):
+        if not scenario.endswith(".toml") and scenario not in scenario_names():
+            known = ", ".join([*mission_names(), *scenario_names()])
+            raise ConfigError(
+                f"scenario {scenario!r} is unknown; use one of {known}, or the path of a .toml file"
+            )
+        flight = simulate(load_scenario(scenario), seed)
+        said = f"{flight.scenario.description} ({len(flight.batch):,} events, seed {flight.seed})"
+        return flight.recording(), said
+    from simulation.mission_log import mission_recording
+    from simulation.world import fly
+
+    flown = fly(load_mission(scenario), seed)
+    said = f"{flown.mission.description} ({len(flown.batch):,} events, seed {flown.seed}): {flown.end}"
+    if flown.contact is not None:
+        touch = flown.contact
+        said += f", contact at {touch.speed_mps:.2f} m/s, {touch.miss_m:.2f} m from the target's centre"
+    return mission_recording(flown), said
 
 
 def run_demo(folder: str | Path, *, seed: int = 1, force: bool = False) -> str:

@@ -24,6 +24,7 @@ class DeckForecast:
     ``height_m``, ``height_sigma_m``, ``rate_mps``, ``rate_sigma_mps`` (m,); ``skill`` (m,) is 1 - variance of the
     rate over that of the sea: 1 is certain, 0 knows nothing but the sea. ``sea_rate_sigma_mps`` is the rate's 1-sigma
     in that sea, ``learned`` tells whether the sea was learned in flight (else it is the configuration's prior).
+    ``sway_mps`` (m, 2) is the velocity of the sway about the anchored place, north and east.
     """
 
     t_ns: int
@@ -35,11 +36,16 @@ class DeckForecast:
     skill: Array
     sea_rate_sigma_mps: float
     learned: bool
+    sway_mps: Array
 
     def rate_at(self, horizon_s: float) -> tuple[float, float]:
         """Return the rate and its 1-sigma [m/s] at a horizon, interpolated, and held beyond the ends."""
         rate = float(np.interp(horizon_s, self.horizon_s, self.rate_mps))
         return rate, float(np.interp(horizon_s, self.horizon_s, self.rate_sigma_mps))
+
+    def sway_at(self, horizon_s: float) -> Array:
+        """Return the sway's velocity (2,) [m/s] at a horizon, interpolated, and held beyond the ends."""
+        return np.array([np.interp(horizon_s, self.horizon_s, axis) for axis in self.sway_mps.T])
 
     def quiet_probability(self, begin_s: float, end_s: float, rate_limit_mps: float) -> float:
         """Return the smallest probability, over the horizons from begin to end, that |rate| is below the limit.
@@ -64,6 +70,7 @@ class DeckForecaster:
     _rows: Array | None = None
     _spread: Array | None = None
     _sea: Array | None = None
+    _sway: Array | None = None
 
     @classmethod
     def at(cls, horizon_s: ArrayLike) -> DeckForecaster:
@@ -76,11 +83,25 @@ class DeckForecaster:
             raise ValueError("horizon_s: must be a list of ascending seconds, from 0 or later")
         return cls(h)
 
-    def forecast(self, t_ns: int, heave: Array, P: Array, parameters: Array, learned: bool) -> DeckForecast:
-        """Return the forecast from the heave states (6,), their covariance (6, 6) and parameters (7,) at ``t_ns``."""
-        if self._parameters is None or not np.array_equal(parameters, self._parameters):
-            self._prepare(parameters)
+    def forecast(
+        self,
+        t_ns: int,
+        heave: Array,
+        P: Array,
+        parameters: Array,
+        learned: bool,
+        sway: Array,
+        oscillator: Array,
+    ) -> DeckForecast:
+        """Return the forecast from the heave states (6,), their covariance (6, 6) and parameters (7,) at ``t_ns``, and
+        from the sway's states (4,) with its angular frequency and damping ratio ``oscillator`` (2,).
+        """
+        both = np.concatenate([parameters, oscillator])
+        if self._parameters is None or not np.array_equal(both, self._parameters):
+            self._prepare(parameters, oscillator)
+            self._parameters = both
         assert self._rows is not None and self._spread is not None and self._sea is not None
+        assert self._sway is not None
         mean = self._rows @ heave
         variance = np.einsum("mki,ij,mkj->mk", self._rows, P, self._rows) + self._spread
         # What is known of the sea alone bounds the doubt.
@@ -90,11 +111,13 @@ class DeckForecaster:
         sigma = np.sqrt(variance)
         return DeckForecast(
             t_ns, self.horizon_s, mean[:, 0], sigma[:, 0], mean[:, 1], sigma[:, 1], skill,
-            math.sqrt(self._sea[1]), learned,
+            math.sqrt(self._sea[1]), learned, self._sway @ sway.reshape(2, 2).T,
         )  # fmt: skip
 
-    def _prepare(self, parameters: Array) -> None:
-        """Fill rows (m, 2, 6) of height and rate, their own spread (m, 2) and the sea's variances (2,)."""
+    def _prepare(self, parameters: Array, oscillator: Array) -> None:
+        """Fill rows (m, 2, 6) of height and rate, their own spread (m, 2) and the sea's variances (2,); and the rows
+        (m, 2) of the sway's velocity.
+        """
         from scipy.linalg import expm
 
         f, S = heave_matrix(parameters), heave_stationary(parameters)
@@ -104,7 +127,9 @@ class DeckForecaster:
         self._rows = np.stack([seen @ expm(f * h) for h in self.horizon_s])
         self._sea = np.einsum("ki,ij,kj->k", seen, S, seen)
         self._spread = self._sea - np.einsum("mki,ij,mkj->mk", self._rows, S, self._rows)
-        self._parameters = parameters.copy()
+        w, zeta = oscillator
+        swing = np.array([[0.0, 1.0], [-w * w, -2.0 * zeta * w]])
+        self._sway = np.stack([expm(swing * h)[1] for h in self.horizon_s])
 
 
 def _between(low: float, high: float, mean: float, sigma: float) -> float:

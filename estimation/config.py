@@ -328,13 +328,11 @@ class LandingConfig(_Table, frozen=True):
     ] = 0.95
     land_probability: Annotated[
         float, _share("being inside r_land must be this probable before the vehicle goes down")
-    ] = 0.95
+    ] = 0.99
     abort_probability: Annotated[
         float,
-        _share(
-            "below this probability of being inside, the descent is broken off (and the observation begun anew)"
-        ),
-    ] = 0.7
+        _share("below this probability of being inside r_land the descent is broken off"),
+    ] = 0.95
     track_tilt_rad: Annotated[
         float,
         _positive(
@@ -401,10 +399,13 @@ class LandingConfig(_Table, frozen=True):
     response_s: Annotated[
         float,
         _not_negative(
-            "lag of the vehicle's velocity behind its set-point: how far ahead the deck's rate is commanded",
+            "lag of the vehicle's vertical velocity behind its set-point: how far ahead the deck's rate is commanded",
             "s",
         ),
     ] = 0.3
+    response_level_s: Annotated[
+        float, _not_negative("the same of the horizontal velocity, for the deck's sway", "s")
+    ] = 0.5
     lost_s: Annotated[float, _positive("the target is lost after this time without a fused fix", "s")] = 1.0
     stale_s: Annotated[float, _positive("an estimate older than this is not flown on", "s")] = 0.3
     sigma_limit_m: Annotated[

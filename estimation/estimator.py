@@ -40,7 +40,7 @@ from estimation.output import Facts, Output, Run, estimate_at
 from estimation.parameters import Site, pack_parameters
 from estimation.rows import HEAVE_MODEL, PENDING, Estimates, FilterState, Int, Rows
 from estimation.screening import malformed
-from estimation.state import BA0, BG0, P0, PH0, PLATFORM_HEAVE, Q0, V0, Layout
+from estimation.state import BA0, BG0, P0, PH0, PLATFORM_HEAVE, PS0, Q0, V0, Layout
 
 EngineName = Literal["auto", "filterpy", "compiled"]
 
@@ -169,7 +169,10 @@ class LandingEstimator:
         block = slice(start, start + HEAVE_SIZE)
         learned = self._learner is not None and self._learner.block is not None
         x = s.x[PH0 : PH0 + HEAVE_SIZE]
-        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], s.heave, learned)
+        c = self.config.platform
+        swing = np.array([2.0 * np.pi / c.sway_period_s, c.sway_damping])
+        sway = s.x[PS0 : PS0 + 4]
+        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], s.heave, learned, sway, swing)
 
     def finish(self) -> None:
         """Settle what is still in the window; measurements that no inertial sample followed were in the future."""

@@ -81,11 +81,11 @@ class Fixes:
     seen: NDArray[np.bool_]
 
 
-def true_fixes(config: VisionConfig, trajectory: Trajectory, t_s: Array, mount_rad: Array) -> Array:
-    """Return the target's centre in a camera with this mounting error at the times t_s (n,), without noise, (n, 3)."""
-    m = trajectory.motion(t_s)
-    deck = trajectory.platform.motion(t_s).position[0]
-    body = np.einsum("nji,nj->ni", m.R_nb, deck - m.position_m) - np.array(config.lever_arm_m)
+def seen_from(config: VisionConfig, position_m: Array, R_nb: Array, deck_m: Array, mount_rad: Array) -> Array:
+    """Return the target's centre in a camera with this mounting error, without noise, (n, 3), for vehicles at
+    ``position_m`` (n, 3) with attitudes ``R_nb`` (n, 3, 3) and targets at ``deck_m`` (n, 3), NED.
+    """
+    body = np.einsum("nji,nj->ni", R_nb, deck_m - position_m) - np.array(config.lever_arm_m)
     R_cb = R_CB_NOMINAL @ quat_to_matrix(euler_to_quat(*config.mount_rpy_rad)).T
     seen: Array = body @ (R_cb @ quat_to_matrix(quat_exp(mount_rad)).T).T
     return seen
@@ -95,8 +95,18 @@ def draw_fixes(
     config: VisionConfig, view: View, trajectory: Trajectory, t_s: Array, errors: CameraErrors,
     rng: np.random.Generator,
 ) -> Fixes:  # fmt: skip
-    """Draw the fixes whose content is of the times t_s (n,). Their noise is what they state and the floor."""
-    true = true_fixes(config, trajectory, t_s, errors.mount_rad)
+    """Draw the fixes whose content is of the times t_s (n,)."""
+    m = trajectory.motion(t_s)
+    deck = trajectory.platform.motion(t_s).position[0]
+    return noisy(
+        config, view, t_s, seen_from(config, m.position_m, m.R_nb, deck, errors.mount_rad), errors, rng
+    )
+
+
+def noisy(
+    config: VisionConfig, view: View, t_s: Array, true: Array, errors: CameraErrors, rng: np.random.Generator
+) -> Fixes:
+    """Draw the fixes of targets at ``true`` (n, 3), camera axes. Their noise is what they state and the floor."""
     distance = np.maximum(np.linalg.norm(true, axis=1, keepdims=True), 1e-6)
     ray = true / distance
     across, along = config.angle_sigma_rad * distance, config.range_sigma * distance

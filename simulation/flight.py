@@ -86,12 +86,12 @@ class Scenario(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=
     @property
     def config(self) -> Config:
         """What the estimator is told."""
-        return _config(self.filter, "filter")
+        return config_of(self.filter, "filter")
 
     @property
     def drawn(self) -> Config:
         """What the sensors are drawn from."""
-        return _config(_merged(self.filter, self.mismatch), "mismatch")
+        return config_of(merged(self.filter, self.mismatch), "mismatch")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class SimulatedFlight:
         arrival = self.place.utc_ns + np.round(t * 1e9).astype(np.int64)
         times = Times(stamp, arrival)
         source = {"sensor": "simulation"}
-        attitude = quaternions(_deck_axes(deck.normal[0]))
+        attitude = quaternions(deck_axes(deck.normal[0]))
         return [
             odometry_series("/truth/odometry", times, m.position_m, m.velocity_mps, m.quaternion, source),
             odometry_series("/truth/platform", times, deck.position[0], deck.position[1], attitude, source),
@@ -195,7 +195,7 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
         raise ConfigError(f"{source}: {error}; correct that entry") from None
     try:
         _ = scenario.config, scenario.drawn
-        _waves(scenario)
+        waves_of(scenario.sea)
     except ValueError as error:
         raise ConfigError(f"{source}: {error}") from None
     return scenario
@@ -205,12 +205,10 @@ def simulate(scenario: Scenario, seed: int | None = None) -> SimulatedFlight:
     """Return a flight: the same for the same scenario and seed (None: the scenario's own)."""
     chosen = scenario.seed if seed is None else seed
     world, air, sensing = np.random.default_rng(chosen).spawn(3)
-    place = _place(scenario)
-    platform = Platform.draw(scenario.raft, Sea.draw(_waves(scenario), world), world)
+    place = place_of(scenario.site, scenario.drawn)
+    platform = Platform.draw(scenario.raft, Sea.draw(waves_of(scenario.sea), world), world)
     wind = scenario.wind
-    speed = (
-        BEAUFORT_WIND_MPS.get(scenario.sea.beaufort or 0, 0.0) if wind.speed_mps is None else wind.speed_mps
-    )
+    speed = wind_speed_mps(wind, scenario.sea)
     blow = Wind.draw(speed, math.radians(wind.direction_deg), wind.sway_m, air)
     gravity = normal_gravity(float(place.origin[0]), float(place.origin[2]))
     trajectory = Trajectory(scenario.plan, blow, platform, gravity)
@@ -219,11 +217,11 @@ def simulate(scenario: Scenario, seed: int | None = None) -> SimulatedFlight:
     return SimulatedFlight(scenario, chosen, trajectory, place, drawn.batch, drawn.slow)
 
 
-def _place(scenario: Scenario) -> Place:
-    site = scenario.site
+def place_of(site: SiteTable, drawn: Config) -> Place:
+    """Return the place of a flight; its declination is the compass's, else the World Magnetic Model's."""
     origin = np.array([math.radians(site.latitude_deg), math.radians(site.longitude_deg), site.altitude_m])
     utc_s = site.utc.replace(tzinfo=site.utc.tzinfo or UTC).timestamp()
-    declination = scenario.drawn.magnetometer.declination_deg
+    declination = drawn.magnetometer.declination_deg
     if declination is None:
         radians = world_magnetic_declination(float(origin[0]), float(origin[1]), float(origin[2]), utc_s)
     else:
@@ -231,15 +229,20 @@ def _place(scenario: Scenario) -> Place:
     return Place(origin, radians, math.radians(site.dip_deg), site.field_t, round(utc_s) * 1_000_000_000)
 
 
-def _waves(scenario: Scenario) -> list[Wave]:
-    sea = scenario.sea
+def waves_of(sea: WavesTable) -> list[Wave]:
+    """Return the systems of waves of a sea; raises ``ValueError`` for a force that is not flown in."""
     waves = list(sea.waves)
     if sea.beaufort is not None:
         waves = [*beaufort(sea.beaufort, math.radians(sea.direction_deg)), *waves]
     return waves
 
 
-def _config(tables: dict[str, Any], source: str) -> Config:
+def wind_speed_mps(wind: WindTable, sea: WavesTable) -> float:
+    """Return the mean speed of the wind: the one given, or that of the sea's Beaufort force."""
+    return BEAUFORT_WIND_MPS.get(sea.beaufort or 0, 0.0) if wind.speed_mps is None else wind.speed_mps
+
+
+def config_of(tables: dict[str, Any], source: str) -> Config:
     """Return a configuration from a scenario's tables, as strictly as from a file."""
     lines = []
     for name, table in tables.items():
@@ -250,14 +253,15 @@ def _config(tables: dict[str, Any], source: str) -> Config:
     return parse_config("\n".join(lines), source)
 
 
-def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Return nested tables in which the entries of ``above`` replace those of ``below``."""
     out = dict(below)
     for key, value in above.items():
-        out[key] = _merged(out.get(key, {}), value) if isinstance(value, dict) else value
+        out[key] = merged(out.get(key, {}), value) if isinstance(value, dict) else value
     return out
 
 
-def _deck_axes(downward: Array) -> Array:
+def deck_axes(downward: Array) -> Array:
     """Return rotations to NED (n, 3, 3) whose third axis is along downward normals (n, 3), the first
     northwards.
     """

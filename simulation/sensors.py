@@ -176,7 +176,7 @@ class Sensors:
         self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator, slow: dict[str, SlowError]
     ) -> EventBatch:
         c = self.config.imu
-        t = _times(stream, trajectory.plan.duration_s)
+        t = sample_times(stream, trajectory.plan.duration_s)
         dt = 1.0 / stream.rate_hz
         m = trajectory.motion(t)
         n = len(t)
@@ -199,7 +199,7 @@ class Sensors:
         self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator, slow: dict[str, SlowError]
     ) -> EventBatch:
         c = self.config.gps
-        t = _times(stream, trajectory.plan.duration_s)
+        t = sample_times(stream, trajectory.plan.duration_s)
         n = len(t)
         m = trajectory.motion(t)
         lever = np.array(c.lever_arm_m)
@@ -235,7 +235,7 @@ class Sensors:
         self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator, slow: dict[str, SlowError]
     ) -> EventBatch:
         c = self.config.barometer
-        t = _times(stream, trajectory.plan.duration_s)
+        t = sample_times(stream, trajectory.plan.duration_s)
         steps = c.bias_walk / math.sqrt(stream.rate_hz) * rng.standard_normal(len(t))
         steps[0] = c.bias_sigma_m * rng.standard_normal()
         height = -trajectory.motion(t).position_m[:, 2] + self.place.origin[2]
@@ -246,7 +246,7 @@ class Sensors:
 
     def _magnetometer(self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator) -> EventBatch:
         c = self.config.magnetometer
-        t = _times(stream, trajectory.plan.duration_s)
+        t = sample_times(stream, trajectory.plan.duration_s)
         place = self.place
         heading = place.declination_rad + c.heading_sigma_rad * rng.standard_normal(len(t))
         level = math.cos(place.dip_rad)
@@ -257,7 +257,7 @@ class Sensors:
 
     def _attitude(self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator) -> EventBatch:
         c = self.config.attitude
-        t = _times(stream, trajectory.plan.duration_s)
+        t = sample_times(stream, trajectory.plan.duration_s)
         sigma = np.array([c.tilt_sigma_rad, c.tilt_sigma_rad, c.yaw_sigma_rad])
         errors = sigma * rng.standard_normal((len(t), 3))
         q = trajectory.motion(t).quaternion
@@ -268,7 +268,7 @@ class Sensors:
 
     def _rangefinder(self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator) -> EventBatch:
         c = self.config.rangefinder
-        t = _times(stream, trajectory.plan.duration_s)
+        t = sample_times(stream, trajectory.plan.duration_s)
         m = trajectory.motion(t)
         height = -m.position_m[:, 2] - c.surface_height_m - (m.R_nb @ np.array(c.lever_arm_m))[:, 2]
         distance = height / m.R_nb[:, 2, 2]
@@ -284,7 +284,7 @@ class Sensors:
         slow: dict[str, SlowError],
     ) -> EventBatch:
         c = self.config.vision
-        t = _times(stream, trajectory.plan.duration_s)
+        t = sample_times(stream, trajectory.plan.duration_s)
         errors = CameraErrors.draw(c, t, rng)
         found = draw_fixes(c, stream.view, trajectory, t, errors, rng)
         constant = np.ones((len(t), 1))
@@ -299,7 +299,7 @@ class Sensors:
 
     def _timesync(self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator) -> EventBatch:
         """Exchanges that the companion asks for: each way takes the stream's delay."""
-        t = _times(stream, trajectory.plan.duration_s)
+        t = sample_times(stream, trajectory.plan.duration_s)
         there, back = (stream.delay_s + rng.exponential(stream.delay_spread_s, len(t)) for _ in range(2))
         asking = self.clocks.get(COMPANION, Clock())
         sent, received = asking.stamp_ns(t), asking.stamp_ns(t + there + back)
@@ -358,7 +358,7 @@ def standard_pressure(altitude_m: Array) -> Array:
     return pressure
 
 
-def _times(stream: Stream, duration_s: float) -> Array:
+def sample_times(stream: Stream, duration_s: float) -> Array:
     """Return the true times at which a sensor samples."""
     return np.arange(stream.first_s, duration_s, 1.0 / stream.rate_hz)
 

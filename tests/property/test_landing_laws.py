@@ -52,6 +52,7 @@ def situations(draw: st.DrawFn, now_ns: int = 0) -> Situation:
     forecast = DeckForecast(
         now_ns, HORIZON, 0.0 * HORIZON, 0.1 + 0.0 * HORIZON, rate * np.cos(HORIZON), sigma + 0.0 * HORIZON,
         0.0 * HORIZON + draw(st.floats(0.0, 1.0)), 0.5, draw(st.booleans()),
+        np.zeros((len(HORIZON), 2)),
     )  # fmt: skip
     return Situation(
         now_ns,

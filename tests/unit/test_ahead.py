@@ -12,10 +12,15 @@ from estimation.config import parse_config
 from estimation.deck import deck_transition, heave_matrix, heave_stationary
 from estimation.estimator import LandingEstimator
 from estimation.parameters import Site, pack_parameters
-from estimation.state import PH0, Layout, nominal_zero
+from estimation.state import PH0, PS0, Layout, nominal_zero
 from simulation.flight import load_scenario, simulate
 
 HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4])
+SWAY = np.array([0.2, -0.1, 0.05, 0.3])
+
+
+CONFIG = parse_config("[platform]\nuse = true\n")
+SWING = np.array([2.0 * math.pi / CONFIG.platform.sway_period_s, CONFIG.platform.sway_damping])
 
 
 def some_heave() -> tuple[np.ndarray, np.ndarray]:
@@ -25,14 +30,15 @@ def some_heave() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
-    layout = Layout.of(parse_config("[platform]\nuse = true\n"))
-    p = pack_parameters(parse_config("[platform]\nuse = true\n"), Site((0.9, 0.1, 0.0), 0.0))
+    layout = Layout.of(CONFIG)
+    p = pack_parameters(CONFIG, Site((0.9, 0.1, 0.0), 0.0))
     start = layout.names.index("platform_heave.1")
     block = slice(start, start + 6)
     x6, P = some_heave()
     x, covariance = nominal_zero(), P.copy()
     x[PH0 : PH0 + 6] = x6
-    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x6, P, HEAVE, True)
+    x[PS0 : PS0 + 4] = SWAY
+    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x6, P, HEAVE, True, SWAY, SWING)
     for _ in range(160):
         F, Q = np.eye(layout.size), np.zeros((layout.size, layout.size))
         y = x.copy()
@@ -43,12 +49,14 @@ def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
     assert forecast.height_m == pytest.approx([x6[5], x[PH0 + 5]], abs=1e-6)
     assert forecast.rate_mps == pytest.approx([rate @ x6, rate @ x[PH0 : PH0 + 6]], abs=1e-6)
     assert forecast.rate_sigma_mps[1] == pytest.approx(math.sqrt(rate @ covariance @ rate), rel=1e-3)
+    assert forecast.sway_mps[0] == pytest.approx(SWAY[[1, 3]])
+    assert forecast.sway_mps[1] == pytest.approx([x[PS0 + 1], x[PS0 + 3]], abs=1e-6)
     assert forecast.height_sigma_m[1] == pytest.approx(math.sqrt(covariance[5, 5]), rel=1e-3)
 
 
 def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
     x6, P = some_heave()
-    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x6, 1e3 * P, HEAVE, False)
+    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x6, 1e3 * P, HEAVE, False, SWAY, SWING)
     sea = heave_stationary(HEAVE)
     rate = heave_matrix(HEAVE)[5]
     assert forecast.sea_rate_sigma_mps == pytest.approx(math.sqrt(rate @ sea @ rate))
@@ -60,7 +68,7 @@ def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
 
 def test_the_probability_of_quiet_is_that_of_the_worst_moment() -> None:
     x6, P = some_heave()
-    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x6, P, HEAVE, True)
+    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x6, P, HEAVE, True, SWAY, SWING)
     chance = forecast.quiet_probability(0.5, 1.5, 0.3)
     rng = np.random.default_rng(1)
     inside = (forecast.horizon_s >= 0.5) & (forecast.horizon_s <= 1.5)

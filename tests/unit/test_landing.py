@@ -42,7 +42,16 @@ def estimate(
 def forecast(t_ns: int, rate: float, skill: float = 0.8) -> DeckForecast:
     ones = np.ones(len(HORIZON))
     return DeckForecast(
-        t_ns, HORIZON, 0 * ones, 0.1 * ones, rate * ones, 0.05 * ones, skill * ones, 0.4, True
+        t_ns,
+        HORIZON,
+        0 * ones,
+        0.1 * ones,
+        rate * ones,
+        0.05 * ones,
+        skill * ones,
+        0.4,
+        True,
+        np.zeros((len(HORIZON), 2)),
     )
 
 

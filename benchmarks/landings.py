@@ -1,0 +1,191 @@
+"""Landings flown in a closed loop: 200 in each sea, against the same vehicle that comes down blindly.
+
+    python benchmarks/landings.py [--landings 200 | --quick] [--sea NAME ...] [--json FILE] [--no-gate]
+
+Every landing is a whole mission: search, tracking, observation, landing, flown on the estimator's estimates, with fixes
+drawn from what the estimator is told. Blind is
+the same mission with the same sea, wind and sensors, whose last descent goes straight down at 0.5 m/s over the target,
+as an autopilot's precision landing does; "slow blind" goes down at the touchdown rate that the landing modes use
+relative to the deck, to tell what is gained by going down slowly from what is gained by following the deck.
+
+Printed are the touchdowns inside r_land, the horizontal miss and the speed into the deck at first contact.
+Exit status 1 when a target is missed, unless --no-gate is given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from joblib import Parallel, delayed
+from targets import Target, Targets, provenance
+
+from estimation.config import LandingConfig
+from estimation.landing import Decision, Mode, Progress, Reason, Situation, step
+from simulation.flight import WavesTable
+from simulation.mission import Mission, load_mission
+from simulation.sea import Wave
+from simulation.world import Guidance, fly
+
+MISSION = "landing_beaufort2_2026_11"
+SWELL = Wave("swell", 0.4, 9.0, 0.2, 0.1)
+SEAS: dict[str, WavesTable] = {
+    "Beaufort 0": WavesTable(beaufort=0),
+    "Beaufort 1": WavesTable(beaufort=1),
+    "Beaufort 2": WavesTable(beaufort=2),
+    "Beaufort 3": WavesTable(beaufort=3),
+    "Beaufort 3 + swell": WavesTable(beaufort=3, waves=(SWELL,)),
+}
+BLIND_RATE_MPS = 0.5
+FIRST_SEED = 5000
+
+
+def straight_down(rate_mps: float) -> Guidance:
+    """Return guidance that comes down at this rate over the target from the moment the landing begins."""
+
+    def guide(before: Progress, seen: Situation, c: LandingConfig) -> tuple[Progress, Decision]:
+        if before.mode is Mode.LANDING and not seen.on_deck:
+            # Kept at the begin of its descent, so that no rule of the landing modes ends it.
+            still = replace(before, descent_ns=seen.now_ns, since_ns=seen.now_ns)
+            after, decision = step(still, seen, relaxed(c))
+            if after.mode is Mode.LANDING:
+                velocity = decision.velocity_mps.copy()
+                velocity[2] = rate_mps
+                return after, replace(decision, velocity_mps=velocity)
+            return after, decision
+        return step(before, seen, c)
+
+    return guide
+
+
+def relaxed(c: LandingConfig) -> LandingConfig:
+    """Return a configuration under which a descent is not broken off for its place."""
+    return msgspec.structs.replace(c, abort_probability=1e-9)
+
+
+GUIDES: dict[str, Callable[[LandingConfig], Guidance]] = {
+    "deckfix": lambda c: step,
+    "blind": lambda c: straight_down(BLIND_RATE_MPS),
+    "slow blind": lambda c: straight_down(c.touchdown_rate_mps),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Landing:
+    end: str
+    aborts: int
+    duration_s: float
+    speed_mps: float
+    miss_m: float
+    in_descent: bool
+
+
+def land(mission: Mission, guide: str, seed: int) -> Landing:
+    flown = fly(mission, seed, guidance=GUIDES[guide](mission.config.landing))
+    aborts = sum(
+        mode is Mode.ABORT and reason is not Reason.GIVEN_UP for _, mode, reason in flown.transitions
+    )
+    touch = flown.contact
+    if touch is None:
+        return Landing(flown.end, aborts, float(flown.t_s[-1]), float("nan"), float("nan"), False)
+    return Landing(flown.end, aborts, touch.t_s, touch.speed_mps, touch.miss_m, touch.mode is Mode.LANDING)
+
+
+def summary(flights: list[Landing], radius: float) -> dict[str, float]:
+    speed = np.array([f.speed_mps for f in flights if np.isfinite(f.speed_mps)])
+    miss = np.array([f.miss_m for f in flights if np.isfinite(f.miss_m)])
+    out = {
+        "landings": float(len(speed)),
+        "flights": float(len(flights)),
+        "outside": float(np.sum(miss > radius)),
+    }
+    out["away from the descent"] = float(sum(np.isfinite(f.speed_mps) and not f.in_descent for f in flights))
+    out["aborts"] = float(sum(f.aborts for f in flights))
+    if len(speed):
+        for name, values in (("speed", speed), ("miss", miss)):
+            for label, share in (("median", 50), ("p95", 95)):
+                out[f"{name}_{label}"] = float(np.percentile(values, share))
+            out[f"{name}_max"] = float(values.max())
+        out["time_median"] = float(np.median([f.duration_s for f in flights]))
+    return out
+
+
+def line(name: str, s: dict[str, float]) -> str:
+    if "speed_median" not in s:
+        return f"  {name:11s} no landing in {s['flights']:.0f}"
+    return (
+        f"  {name:11s} {s['landings']:4.0f}/{s['flights']:.0f} landed, {s['outside']:.0f} outside r_land, "
+        f"{s['aborts']:.0f} aborts; contact {s['speed_median']:.2f} median {s['speed_p95']:.2f} p95 "
+        f"{s['speed_max']:.2f} max m/s; miss {s['miss_median']:.2f} median {s['miss_p95']:.2f} p95 "
+        f"{s['miss_max']:.2f} max m; {s['time_median']:.0f} s"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--landings", type=int, default=200, help="in each sea")
+    parser.add_argument("--quick", action="store_true", help="20 in each sea")
+    parser.add_argument("--sea", nargs="+", choices=list(SEAS), default=list(SEAS))
+    parser.add_argument("--guide", nargs="+", choices=list(GUIDES), default=list(GUIDES))
+    parser.add_argument("--jobs", type=int, default=-1)
+    parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument("--no-gate", action="store_true", help="exit with 0 in any case")
+    arguments = parser.parse_args()
+    count = 20 if arguments.quick else arguments.landings
+    base = load_mission(MISSION)
+    radius = base.config.landing.r_land_m
+    document: dict[str, object] = {
+        "benchmark": "landings",
+        **provenance(),
+        "landings": count,
+        "r_land_m": radius,
+    }
+    targets = Targets()
+    outside = stray = 0.0
+    for sea in arguments.sea:
+        mission = msgspec.structs.replace(base, sea=SEAS[sea])
+        begin = time.perf_counter()
+        found: dict[str, dict[str, float]] = {}
+        for guide in arguments.guide:
+            jobs = (delayed(land)(mission, guide, FIRST_SEED + k) for k in range(count))
+            flights = list(Parallel(n_jobs=arguments.jobs)(jobs))
+            found[guide] = summary(flights, radius)
+            ends = Counter(f.end for f in flights)
+            if guide == "deckfix":
+                outside += found[guide]["outside"]
+                stray += found[guide]["away from the descent"]
+            print(
+                ("" if found.keys() - {guide} else f"{sea}\n") + line(guide, found[guide]),
+                dict(ends),
+                flush=True,
+            )
+        print(f"  {time.perf_counter() - begin:.0f} s", flush=True)
+        document[sea] = found
+        if sea != "Beaufort 0" and {"deckfix", "blind"} <= found.keys():
+            ratios = {k: found["deckfix"][k] / found["blind"][k] for k in ("speed_median", "speed_p95")}
+            print("  contact speed over blind: " + ", ".join(f"{k} {v:.2f}" for k, v in ratios.items()))
+            if sea in ("Beaufort 2", "Beaufort 3"):
+                for k, v in ratios.items():
+                    targets.add(Target(f"{sea}: contact {k} over blind", v, 0.65))
+    targets.add(Target("touchdowns outside r_land", outside, 0))
+    targets.add(Target("touchdowns not in a descent of the landing mode", stray, 0))
+    met = targets.report()
+    document["targets"] = targets.as_rows()
+    if arguments.json:
+        arguments.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    if not met and not arguments.no_gate:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
