@@ -89,7 +89,8 @@ def finite(value: Any) -> Any:
 
 def digest(result: Result) -> str:
     """Return a result in a few lines of plain text."""
-    from deckfix.findings import Severity, findings, verdict
+    from deckfix.finding import Severity
+    from deckfix.findings import findings, verdict
     from estimation.outcome import Outcome
 
     found = findings(result)

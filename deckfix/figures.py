@@ -61,7 +61,7 @@ def height(result: Result) -> Figure:
         margin = 0.15 * (shown[1] - shown[0])
         axes["yaxis"]["range"] = [shown[0] - margin, shown[1] + margin]
     figure: Figure = {"data": _height_traces(result, 1, legend=True), "layout": layout(420, **axes)}
-    figure["layout"]["shapes"] = _contact_shapes(result)
+    figure["layout"]["shapes"] = contact_shapes(result)
     return figure
 
 
@@ -254,14 +254,14 @@ def _curve_traces(result: Result, curves: _Curves, first_axes: int, *, legend: b
 
 def _three_panels(result: Result, curves: _Curves) -> Figure:
     axes = stacked(_titles(curves), _ranges(result, curves), result.duration_s)
-    shapes = [s for row in (1, 2, 3) for s in _contact_shapes(result, row)]
+    shapes = [s for row in (1, 2, 3) for s in contact_shapes(result, row)]
     return {
         "data": _curve_traces(result, curves, 1, legend=True),
         "layout": layout(500, shapes=shapes, **axes),
     }
 
 
-def _contact_shapes(result: Result, row: int = 1) -> list[dict[str, object]]:
+def contact_shapes(result: Result, row: int = 1) -> list[dict[str, object]]:
     """Return a line at the moment of contact, where it is known."""
     if result.judged.contact_ns is None:
         return []

@@ -3,33 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 
+from deckfix.deck_findings import deck_findings
+from deckfix.finding import Finding, Severity
 from deckfix.result import Result
 from estimation.events import Kind
 from estimation.outcome import EXPLANATIONS, Outcome
-
-
-class Severity(IntEnum):
-    """How much a finding matters."""
-
-    NOTE = 0
-    WARNING = 1
-    SERIOUS = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One symptom with its likely cause and remedy, in the user's words (plain text, not escaped)."""
-
-    severity: Severity
-    symptom: str
-    cause: str
-    remedy: str
-
 
 _REMEDIES: dict[Outcome, tuple[str, str]] = {
     Outcome.REJECTED_GATE: (
@@ -79,6 +60,7 @@ def findings(result: Result) -> list[Finding]:
         _inputs,
         _outcomes,
         _consistency,
+        deck_findings,
         _biases,
         _uncertainty,
         _messages,
@@ -156,7 +138,15 @@ def _problems(result: Result) -> Iterator[Finding]:
         )
 
 
-_ALARMING = ("no inertial sample", "went back", "aligning again", "contradicted", "diverg", "lost")
+_ALARMING = (
+    "no inertial sample",
+    "went back",
+    "aligning again",
+    "contradicted",
+    "diverg",
+    "lost",
+    "watchdog",
+)
 
 
 def _notes(result: Result) -> Iterator[Finding]:
@@ -243,6 +233,18 @@ def _outcomes(result: Result) -> Iterator[Finding]:
             )
 
 
+_TOO_LARGE = (
+    "its noise is set too small, its latency or calibration is wrong, or it contradicts others",
+    "raise its sigma, or find the offset in its innovations",
+)
+_TOO_LARGE_VISION = (
+    "the camera's mount, focal length or latency is off, the fixes' stated covariance is too small, or the deck moves "
+    "in a way that the model does not know",
+    "deckfix calibrate the camera; set vision.mount_rpy_rad and vision.latency_s; where the innovations grow with "
+    "height raise vision.angle_sigma_rad and range_sigma, where they do not vision.floor_m",
+)
+
+
 def _consistency(result: Result) -> Iterator[Finding]:
     for sensor in result.measured:
         statistics = result.nis(sensor)
@@ -250,11 +252,12 @@ def _consistency(result: Result) -> Iterator[Finding]:
             continue
         mean = statistics.mean_over_dof
         if mean > 2.0:
+            cause, remedy = _TOO_LARGE_VISION if sensor.split("/")[0] == "vision" else _TOO_LARGE
             yield Finding(
                 Severity.SERIOUS if mean > 6.0 else Severity.WARNING,
                 f"{sensor}: innovations are {np.sqrt(mean):.1f} times larger than expected",
-                "its noise is set too small, its latency or calibration is wrong, or it contradicts others",
-                "raise its sigma, or find the offset in its innovations",
+                cause,
+                remedy,
             )
         elif mean < 0.2:
             yield Finding(

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from deckfix import figures, sensor_figures
+from deckfix import figures, report_deck, sensor_figures
 from deckfix._version import __version__
-from deckfix.findings import Finding, Severity, findings, verdict
+from deckfix.finding import Finding, Severity
+from deckfix.findings import findings, verdict
 from deckfix.page import Plots, document, table, text
 from deckfix.reference import RATIOS
 from deckfix.result import Result
@@ -32,9 +33,12 @@ def render(result: Result) -> str:
         ("wrong", "What went wrong", _wrong(found)),
         ("track", "Track", _track(result, plots)),
         ("estimate", "Estimate", _estimate(result, plots)),
+        ("platform", "Platform", report_deck.platform(result, plots)),
+        ("heave", "Heave", report_deck.heave(result, plots)),
         ("measurements", "Measurements", _measurements(result, plots)),
         ("outcomes", "Outcomes", _outcomes(result, plots)),
         ("states", "Biases and other states", _states(result, plots)),
+        ("clocks", "Clocks", report_deck.clocks(result, plots)),
         ("inputs", "Rates and gaps", _inputs(result, plots)),
         ("configuration", "Configuration", _configuration(result)),
     ]
@@ -279,29 +283,16 @@ def _inputs(result: Result, plots: Plots) -> str:
         rows.append(("", [*cells, str(len(s.gaps)), start]))
     heads = ("sensor", "kind", "messages", "rate", "gaps", "longest gap")
     about = "A gap is an interval of more than five times the usual one."
-    clock = ""
-    if result.clocks:
-        entries = [
-            ("", [text(name), *(text(_number(v)) for v in values.values())])
-            for name, values in result.clocks.items()
-        ]
-        names = list(next(iter(result.clocks.values())))
-        clock = "<h3>Clocks</h3>" + table(("clock", *(text(n.replace("_", " ")) for n in names)), entries)
     return (
         f'<p class="lead">{about}</p>'
         + plots.place(sensor_figures.coverage(result), "When each sensor spoke")
         + table(heads, rows, numeric=(2, 3, 4, 5))
-        + clock
     )
 
 
 def _name(sensor: str) -> str:
     """Return a sensor's name that may break at its underscores."""
     return text(sensor).replace("_", "_<wbr>")
-
-
-def _number(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
 def _configuration(result: Result) -> str:

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from synthetic_result import synthetic_result
 
-from deckfix.findings import Severity, findings, verdict
+from deckfix.finding import Severity
+from deckfix.findings import findings, verdict
 from deckfix.result import Result
 from deckfix.streams import stream
 from estimation.events import Kind
