@@ -319,6 +319,7 @@ def _line_moments(
             row, pixels = lines.row[i], lines.pixels[i]
             s, square = row[SIDE], blur[i] * blur[i]
             sigma = gaussian_part(blur[i], box[i])
+            reach = 0.5 * box[i] + 7.0 * sigma
             moved = shift_px[i] - square * row[BEND]
             grown = 2.0 * growth_px * s - square * row[BEND]
             outer = grown - row[OUTWARD_PX] + square * row[OUTWARD_BEND]
@@ -332,7 +333,11 @@ def _line_moments(
                 if with_neighbours:
                     for offset in (outer, inner):
                         away = min(max(distance + offset, -FAR_PX), FAR_PX)
-                        r, d, w = edge_profile(away, sigma, box[i])
+                        if abs(away) > reach:
+                            # All of the step, or none: what the profile gives there, to 1e-10.
+                            r, d, w = (1.0 if away > 0.0 else 0.0), 0.0, 0.0
+                        else:
+                            r, d, w = edge_profile(away, sigma, box[i])
                         rise -= r
                         slope -= d
                         wider -= w

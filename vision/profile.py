@@ -121,7 +121,8 @@ def edge_profile(distance: Any, sigma: Any, box: Any) -> tuple[Any, Any, Any]:
 
 def pixel_box(nu: Any, nv: Any) -> Any:
     """Return the width of a pixel along the normal (nu, nv) of an edge [px]: the longer of its two shadows."""
-    return np.maximum(np.abs(nu), np.abs(nv))
+    # Never below 0.7, but at the target's very centre, where there is no normal.
+    return np.maximum(np.maximum(np.abs(nu), np.abs(nv)), 0.5)
 
 
 def motion_of(blur_xy: Array) -> Array:
