@@ -210,6 +210,7 @@ def _fuse(
     result[1] = m
     if kind == VISION:
         result[8], result[9] = seen_height(r, R, x, p)
+    result[10] = math.log(_determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     if w == 0.0:
@@ -254,6 +255,20 @@ def _innovation_covariance(H: Array, PHt: Array, R: Array, scale: float, m: int)
             for k in range(PHt.shape[0]):
                 S[i, j] += H[i, k] * PHt[k, j]
     return S
+
+
+def _determinant(S: Array, m: int) -> float:
+    """Return the determinant of the leading (m, m) part."""
+    if m == 1:
+        return float(S[0, 0])
+    minor = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+    if m == 2:
+        return float(minor)
+    return float(
+        S[2, 2] * minor
+        - S[2, 1] * (S[0, 0] * S[1, 2] - S[0, 2] * S[1, 0])
+        + S[2, 0] * (S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1])
+    )
 
 
 def _inverse(S: Array, m: int) -> Array:
@@ -343,7 +358,7 @@ def _congruence(A: Array, P: Array, out: Array) -> None:
             out[i, j] = value
 
 
-for _helper in (_congruence, _innovation_covariance, _inverse, _joseph, _reset_attitude):
+for _helper in (_congruence, _determinant, _innovation_covariance, _inverse, _joseph, _reset_attitude):
     register_jitable(_helper)
 register_jitable(_propagate_covariance)
 register_jitable(_propagate)

@@ -96,16 +96,7 @@ class LandingEstimator:
         self._history = History(int(c.filter.window_s * 1e9))
         self._clocks = ClockBank(AUTOPILOT)
         self._period_ns = round(1e9 / c.filter.output_rate_hz) if c.filter.output_rate_hz else 0
-        imu_latency = self.facts.imu_latency_s if c.imu.latency_s is None else c.imu.latency_s
-        latency = np.zeros(len(Kind))
-        latency[Kind.IMU] = imu_latency
-        latency[Kind.GPS_POSITION] = latency[Kind.GPS_VELOCITY] = c.gps.latency_s
-        latency[Kind.BAROMETER] = c.barometer.latency_s
-        latency[Kind.MAGNETOMETER] = c.magnetometer.latency_s
-        latency[Kind.ATTITUDE] = c.attitude.latency_s
-        latency[Kind.RANGEFINDER] = c.rangefinder.latency_s
-        latency[Kind.VISION] = c.vision.latency_s
-        self._latency = np.round(latency * 1e9)
+        self._latency = np.round(latencies_s(c, self.facts) * 1e9)
         if c.platform.use and c.platform.learn_s > 0.0:
             self._learner = HeaveLearner(
                 c.platform.learn_s, c.platform.learn_window_s, 0.3 * c.platform.heave_sigma_m
@@ -468,6 +459,19 @@ class LandingEstimator:
             declination_rad=self._site.declination_rad if self._site else None,
             missing="" if self._engine is not None else self._aligner.missing,
         )
+
+
+def latencies_s(config: Config, facts: Facts) -> Array:
+    """Return the age of each kind's content at its stamp [s], shape (len(Kind),)."""
+    latency = np.zeros(len(Kind))
+    latency[Kind.IMU] = facts.imu_latency_s if config.imu.latency_s is None else config.imu.latency_s
+    latency[Kind.GPS_POSITION] = latency[Kind.GPS_VELOCITY] = config.gps.latency_s
+    latency[Kind.BAROMETER] = config.barometer.latency_s
+    latency[Kind.MAGNETOMETER] = config.magnetometer.latency_s
+    latency[Kind.ATTITUDE] = config.attitude.latency_s
+    latency[Kind.RANGEFINDER] = config.rangefinder.latency_s
+    latency[Kind.VISION] = config.vision.latency_s
+    return latency
 
 
 def _choose(engine: EngineName) -> str:

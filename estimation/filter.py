@@ -147,6 +147,7 @@ class FilterPyEngine:
         rows.result[i, 1] = m
         rows.result[i, 2 : 2 + m] = r
         rows.result[i, 5 : 5 + m] = np.sqrt(np.diag(S))
+        rows.log_det[i] = np.linalg.slogdet(S)[1]
         if kind == models.VISION:
             rows.seen[i] = seen_height(r, R, s.x, self.p)
         w = update.weight(nis, m, self.p)

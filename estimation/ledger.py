@@ -68,6 +68,7 @@ class Ledger:
         axis = np.arange(3) < r.result[:, 1:2]
         records["innovation"] = np.where(axis, r.result[:, 2:5], np.nan)
         records["sigma"] = np.where(axis, r.result[:, 5:8], np.nan)
+        records["log_det"] = np.where(r.result[:, 1] > 0, r.log_det, np.nan)
         records["age_s"] = r.age_ns * 1e-9
         for i in np.flatnonzero(r.reset):
             name, size = names.sensors[int(r.sensor[i])], float(np.linalg.norm(r.result[i, 2:5]))

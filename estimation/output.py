@@ -25,12 +25,13 @@ RECORD_DTYPE = np.dtype(
         ("nis", np.float64),
         ("innovation", np.float64, (3,)),
         ("sigma", np.float64, (3,)),
+        ("log_det", np.float64),
         ("age_s", np.float64),
     ]
 )
 """One fusion attempt: time of the content on the estimator's clock, the event's own stamp and arrival, the sensor's
-index, ``Outcome``, degrees of freedom, NIS, innovation with its predicted 1-sigma (NaN where there was no
-comparison), and the age at arrival."""
+index, ``Outcome``, degrees of freedom, NIS, innovation with its predicted 1-sigma and the logarithm of its
+covariance's determinant (NaN where there was no comparison), and the age at arrival."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ PENDING = -1
 
 T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = range(10)
 """Columns of ``Rows.ints``."""
-VALUE, OWN, RESULT, SEEN, FLOATS = 0, 6, 12, 20, 22
+VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 22, 23
 """First columns in ``Rows.floats``, and their number."""
 HEAVE_MODEL = 10
 """Kind of a row that is no measurement: from here on the heave has the seven parameters in ``value`` and ``own``."""
@@ -30,14 +30,14 @@ HEAVE_MODEL = 10
 
 @dataclass(slots=True)
 class Rows:
-    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 22), with a view for each column.
+    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 23), with a view for each column.
 
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
     the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
     the inertial clock was past the content when it arrived. ``value`` and ``own`` (n, 6) are the event's value and
     covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved) and ``result`` (n, 8):
-    NIS, dimension, innovation (3), its predicted sigma (3), and ``seen`` (n, 2): height of the deck as a fix shows
-    it [m] and its variance.
+    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 2): height of the deck as a fix shows
+    it [m] and its variance, and ``log_det``: logarithm of the determinant of the innovation's covariance.
     """
 
     ints: Int
@@ -122,7 +122,12 @@ class Rows:
     @property
     def seen(self) -> Array:
         """Height of the deck as a fix shows it [m], and its variance [m^2]."""
-        return self.floats[:, SEEN:FLOATS]
+        return self.floats[:, SEEN:LOG_DET]
+
+    @property
+    def log_det(self) -> Array:
+        """Logarithm of the determinant of the innovation's covariance, before any weight."""
+        return self.floats[:, LOG_DET]
 
     def take(self, index: slice | Int) -> Rows:
         """Return the rows of an index: views for a slice, copies for an array."""
