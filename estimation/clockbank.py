@@ -203,11 +203,9 @@ class ClockBank:
 
     def convert(self, clock: str, stamp_ns: int) -> Reading | None:
         """Take a stamp to the estimator's clock, or return None where nothing connects the two yet."""
-        if clock == self.estimator_clock:
-            return Reading(stamp_ns, 0.0, "same")
-        reading = self._by_exchanges(clock, stamp_ns) or self._by_arrivals(clock, stamp_ns)
-        if reading is None:
-            return None
+        reading = self.look(clock, stamp_ns)
+        if reading is None or clock == self.estimator_clock:
+            return reading
         highest = self._highest.get(clock)
         if highest is None:
             self._highest[clock] = (stamp_ns, reading.time_ns)
@@ -219,6 +217,12 @@ class ClockBank:
         if later:
             self._highest[clock] = (stamp_ns, reading.time_ns)
         return reading
+
+    def look(self, clock: str, stamp_ns: int) -> Reading | None:
+        """Return what ``convert`` would, but for the order of stamps, which is neither kept nor changed."""
+        if clock == self.estimator_clock:
+            return Reading(stamp_ns, 0.0, "same")
+        return self._by_exchanges(clock, stamp_ns) or self._by_arrivals(clock, stamp_ns)
 
     def summary(self, at_ns: int) -> list[ClockSummary]:
         """Return every clock met so far against the estimator's, at a time of the estimator's clock."""

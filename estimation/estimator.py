@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from estimation.ahead import DeckForecast, DeckForecaster
 from estimation.alignment import Aligner
-from estimation.clockbank import ClockBank
+from estimation.clockbank import ClockBank, ClockSummary
 from estimation.config import Config, ConfigError
 from estimation.deck import HEAVE_SIZE
 from estimation.events import (
@@ -112,6 +112,28 @@ class LandingEstimator:
     def ready(self) -> bool:
         """True once estimates come out."""
         return self._engine is not None
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The names that the records' sensor indices mean."""
+        return tuple(self._names.sensors)
+
+    @property
+    def origin(self) -> Array | None:
+        """Latitude [rad], longitude [rad] and altitude [m] of the NED origin; None before the start."""
+        return None if self._site is None else np.array(self._site.origin)
+
+    def clocks(self, at_ns: int) -> list[ClockSummary]:
+        """Return every other clock against the inertial one, at a time of that clock."""
+        return self._clocks.summary(at_ns)
+
+    def inertial_time_ns(self, clock: str, stamp_ns: int) -> int | None:
+        """Return a stamp of a clock on the inertial clock, as known by now; None where nothing connects them.
+
+        Latency is not corrected, and nothing of the estimator's state changes.
+        """
+        reading = self._clocks.look(clock, stamp_ns)
+        return None if reading is None else reading.time_ns
 
     def add_sensor(self, name: str, model: Model, latency_s: float = 0.0) -> None:
         """Take measurements of a sensor of the user's (events ``UserMeasurement`` with this name).

@@ -18,7 +18,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.events import EVENT_DTYPE, Event, EventBatch, Kind, Names
+from estimation.events import (
+    EVENT_DTYPE,
+    Attitude,
+    Event,
+    EventBatch,
+    Imu,
+    Kind,
+    Magnetometer,
+    Names,
+)
 from logs.event_columns import KELVIN, READ, TEMPERATURE, WRITE, count_known
 from logs.recording import Series
 from logs.topics import new_rows, row_dtype
@@ -41,6 +50,9 @@ KINDS: dict[str, tuple[Kind, str]] = {
 
 EVENT_TOPICS = (*KINDS, "/baro/temperature")
 
+_KEPT = (Imu, Magnetometer, Attitude)
+"""Events of which a log holds every bit."""
+
 _TOPIC = {kind: topic for topic, (kind, _) in KINDS.items()}
 
 
@@ -54,6 +66,8 @@ def series_of_event(event: Event) -> list[Series]:
 
 def as_logged(event: Event) -> Event:
     """Return the event as a log gives it back."""
+    if isinstance(event, _KEPT):
+        return event
     return next(iter(events_of_series(series_of_event(event))))
 
 

@@ -221,6 +221,7 @@ TOPICS: Mapping[str, Topic] = {
 """Every topic that deckfix writes, by name."""
 
 
+@lru_cache(maxsize=256)
 def row_dtype(topic_or_type: str, **lengths: int) -> np.dtype[np.void]:
     """Return the columns of a topic's (or a message type's) messages, native and packed.
 
