@@ -8,12 +8,12 @@ imported.
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from logs import mavlink_sensors as ms
 from logs.ardupilot import filter_delay
 from logs.companion import read_companion
 from logs.dataflash_format import text_of
@@ -23,37 +23,19 @@ from logs.sensors import (
     DEBUG,
     ERROR,
     FATAL,
-    FIX,
     INFO,
-    NO_FIX,
-    NOT_MEASURED,
-    RTK_FIXED,
-    RTK_FLOAT,
     WARN,
     Floats,
     Stamps,
-    attitude_series,
-    barometer_series,
+    Times,
     columns,
-    fix_series,
-    imu_series,
     log_series,
-    magnetometer_series,
     odometry_series,
-    quaternions_from_euler,
-    range_series,
-    velocity_series,
 )
 from logs.tlog import read_telemetry
 from logs.vehicles import IMU_MESSAGES, Autopilot, find_autopilot
 
-_STANDARD_GRAVITY = 9.80665
-_DOWNWARD = 25
-_HOLD_NS = 200_000_000
 _ARDUPILOT = 3
-_UNKNOWN_COURSE = 65535
-_SPEED_SIGMA_MPS = 0.5
-_STATUS = np.array([NO_FIX, NO_FIX, NO_FIX, FIX, FIX, RTK_FLOAT, RTK_FIXED, FIX, FIX], dtype=np.int8)
 _LEVELS = (FATAL, FATAL, FATAL, ERROR, WARN, INFO, INFO, DEBUG)
 _HANDLED = {"HEARTBEAT", "PARAM_VALUE", "SYSTEM_TIME", "GPS_GLOBAL_ORIGIN", "HOME_POSITION"}
 
@@ -114,41 +96,23 @@ def _imu(autopilot: Autopilot, ardupilot: bool, delay: dict[str, str]) -> list[S
         if found is None:
             continue
         data, times = found
-        acceleration = columns(data["xacc"], data["yacc"], data["zacc"])
-        rate = columns(data["xgyro"], data["ygyro"], data["zgyro"])
-        field = columns(data["xmag"], data["ymag"], data["zmag"])
-        if name == "HIGHRES_IMU":
-            first = data["id"] == 0
-            data, times = data[first], times[first]
-            acceleration, rate, field = acceleration[first], rate[first], field[first] * _gauss(field[first])
-        else:
-            acceleration, rate, field = acceleration * 1e-3 * _STANDARD_GRAVITY, rate * 1e-3, field * 1e-7
+        first = ms.first_imu(name, data)
+        data, times = data[first], times[first]
         if not len(times):
             continue
-        made = [imu_series(times, rate, acceleration, 0, {"message": name, **delay})]
+        made = [ms.imu(name, data, times, delay)]
+        field = ms.magnetic(name, data, ms.gauss_factor(data))
         if np.any(field):
             fresh = _changes(field, times.stamp_ns)
-            made.append(magnetometer_series(times[fresh], field[fresh], 0, {"message": name}))
+            made.append(ms.compass(name, field[fresh], times[fresh]))
         if (
             name == "HIGHRES_IMU"
             and autopilot.timed("SCALED_PRESSURE") is None
             and data["abs_pressure"].any()
         ):
-            pressure = 100.0 * data["abs_pressure"].astype(np.float64)
-            fresh = _changes(pressure[:, np.newaxis], times.stamp_ns)
-            made += barometer_series(
-                times[fresh], pressure[fresh], data["temperature"][fresh], 0, {"message": name}
-            )
+            made += _pressures(name, data, times)
         return made
     return []
-
-
-def _gauss(field: Floats) -> float:
-    """Return the factor to tesla: gauss by the standard, but ArduPilot sends them times a power of 1000."""
-    strength = float(np.median(np.linalg.norm(field, axis=1)))
-    if not math.isfinite(strength) or strength < 10.0:
-        return 1e-4
-    return 1e-4 * 10.0 ** (-3 * round(math.log10(strength / 0.5) / 3))
 
 
 def _changes(values: Floats, stamp_ns: Stamps) -> NDArray[np.bool_]:
@@ -159,71 +123,34 @@ def _changes(values: Floats, stamp_ns: Stamps) -> NDArray[np.bool_]:
     changed = np.ones(len(values), dtype=np.bool_)
     changed[1:] = np.any(values[1:] != values[:-1], axis=1)
     since = np.maximum.accumulate(np.where(changed, np.arange(len(values)), 0))
-    waits = (stamp_ns - stamp_ns[since]) // _HOLD_NS
+    waits = (stamp_ns - stamp_ns[since]) // ms.HOLD_NS
     keep = changed.copy()
     keep[1:] |= waits[1:] > waits[:-1]
     return keep
 
 
 def _undulation(autopilot: Autopilot) -> float | None:
-    """Return the geoid's height above the ellipsoid [m] that the receiver gave, or None."""
-    data = autopilot.messages("GPS_RAW_INT").data
-    data = data[(data["fix_type"] >= 3) & (data["alt_ellipsoid"] != 0)]
-    return (
-        1e-3 * float(np.median(data["alt_ellipsoid"] - data["alt"].astype(np.int64))) if len(data) else None
-    )
+    return ms.undulation_of(autopilot.messages("GPS_RAW_INT").data)
 
 
 def _gps(autopilot: Autopilot, undulation: float | None) -> list[Series]:
-    """Return /gps/fix and /gps/velocity, whose vertical part GPS_RAW_INT does not have (a huge variance)."""
     found = autopilot.timed("GPS_RAW_INT")
     if found is None:
         return []
     data, times = found
     fresh = np.ones(len(times), dtype=np.bool_)
     fresh[1:] = np.diff(times.stamp_ns) > 0
-    data, times = data[fresh], times[fresh]
-    status = _STATUS[np.minimum(data["fix_type"], len(_STATUS) - 1)]
-    altitude = 1e-3 * data["alt"] + (undulation or 0.0)
-    datum = "mean sea level" if undulation is None else "ellipsoid"
-    metadata = {"message": "GPS_RAW_INT", "altitude_datum": datum}
-    position = fix_series(
-        times,
-        1e-7 * data["lat"],
-        1e-7 * data["lon"],
-        altitude,
-        status,
-        1e-3 * data["h_acc"],
-        1e-3 * data["v_acc"],
-        0,
-        metadata,
-    )
-    course = np.radians(1e-2 * data["cog"])
-    speed = 1e-2 * data["vel"]
-    moving = (data["vel"] != _UNKNOWN_COURSE) & (data["cog"] != _UNKNOWN_COURSE) & (status != NO_FIX)
-    if not moving.any():
-        return [position]
-    sigma = 1e-3 * data["vel_acc"]
-    sigma = np.where(sigma > 0.0, sigma, _SPEED_SIGMA_MPS)[moving]
-    horizontal = columns(speed * np.cos(course), speed * np.sin(course), np.zeros(len(speed)))[moving]
-    metadata |= {
-        "vertical": "not measured: its variance is 1e6",
-        "sigma": f"vel_acc, {_SPEED_SIGMA_MPS} m/s where it is 0",
-    }
-    velocity = velocity_series(times[moving], horizontal, sigma, 0, metadata)
-    velocity.data["twist_covariance"][:, 14] = NOT_MEASURED
-    return [position, velocity]
+    return ms.satellite(data[fresh], times[fresh], undulation)
 
 
 def _air(autopilot: Autopilot) -> list[Series]:
     found = autopilot.timed("SCALED_PRESSURE")
-    if found is None:
-        return []
-    data, times = found
-    fresh = _changes(data["press_abs"][:, np.newaxis], times.stamp_ns)
-    data, times = data[fresh], times[fresh]
-    pressure = 100.0 * data["press_abs"].astype(np.float64)
-    return barometer_series(times, pressure, 1e-2 * data["temperature"], 0, {"message": "SCALED_PRESSURE"})
+    return [] if found is None else _pressures("SCALED_PRESSURE", *found)
+
+
+def _pressures(name: str, data: NDArray[np.void], times: Times) -> list[Series]:
+    fresh = _changes(ms.pressure(name, data)[0][:, np.newaxis], times.stamp_ns)
+    return ms.air(name, data[fresh], times[fresh])
 
 
 def _range(autopilot: Autopilot) -> list[Series]:
@@ -231,16 +158,11 @@ def _range(autopilot: Autopilot) -> list[Series]:
     if found is None:
         return []
     data, times = found
-    down = data["orientation"] == _DOWNWARD
+    down = ms.downward(data)
     if not down.any():
         return []
     down &= data["id"] == data["id"][down][0]
-    data = data[down]
-    metres = [1e-2 * data[f"{n}_distance"] for n in ("current", "min", "max")]
-    kind = int(data["type"][0] == 0)
-    return [
-        range_series(times[down], metres[0], metres[1], metres[2], kind, 0, {"message": "DISTANCE_SENSOR"})
-    ]
+    return [ms.ranges(data[down], times[down])]
 
 
 def _own_estimate(
@@ -252,12 +174,7 @@ def _own_estimate(
         found = autopilot.timed(name)
         if found is None:
             continue
-        data, times = found
-        if name == "ATTITUDE":
-            q = quaternions_from_euler(data["roll"], data["pitch"], data["yaw"])
-        else:
-            q = columns(*(data[f"q{k}"] for k in (1, 2, 3, 4)))
-        made.append(attitude_series(times, q, {"message": name}))
+        made.append(ms.attitude(name, *found))
         break
     local = autopilot.timed("LOCAL_POSITION_NED")
     if local is not None:
