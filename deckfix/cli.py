@@ -18,6 +18,7 @@ import click
 
 from deckfix._version import __version__
 from deckfix.cli_detect import detect
+from deckfix.cli_heave import heave
 from deckfix.cli_vision import calibrate, target
 
 # The matrices here are small: threads of the linear algebra library only wait for each other. It reads this when
@@ -32,7 +33,19 @@ _ENGINE = click.option(
 _FORCE = click.option("--force", is_flag=True, help="Overwrite output files that exist.")
 
 
-_ORDER = ("demo", "simulate", "import", "info", "replay", "report", "export", "detect", "target", "calibrate")
+_ORDER = (
+    "demo",
+    "simulate",
+    "import",
+    "info",
+    "replay",
+    "report",
+    "export",
+    "heave",
+    "detect",
+    "target",
+    "calibrate",
+)
 
 
 class _Ordered(click.Group):
@@ -196,6 +209,7 @@ def demo(output: str, seed: int, force: bool) -> None:
 deckfix.add_command(detect)
 deckfix.add_command(target)
 deckfix.add_command(calibrate)
+deckfix.add_command(heave)
 
 
 def _say(text: str) -> None:

@@ -26,13 +26,16 @@ from deckfix.plotting import (
     limits,
     line,
     points,
+    rgba,
     stacked,
 )
+from deckfix.reference import Column
 from estimation.heave.model import HeaveModel
 
 SHOWN_HORIZONS_S = (1.0, 2.0, 3.0)
 AHEAD_S = 8.0
 BEHIND_S = 40.0
+WHISKERS = rgba(AXES[1], 0.45)
 
 
 def spectrum(model: HeaveModel) -> Figure:
@@ -123,7 +126,7 @@ def against_what_happened(
         data.append(line(happened_s, happened_m, name, TRUTH, row, legend=row == 1, width=1.1))
         whiskers = {
             "type": "data", "array": sigma.astype(np.float32), "thickness": 1, "width": 0,
-            "color": "rgba(42,127,98,0.45)",
+            "color": WHISKERS,
         }  # fmt: skip
         made_points = points(t, mean, "forecast ± 95 %", AXES[1], row, legend=row == 1, size=4.5)
         if len(t) > 2 * 800:
@@ -132,6 +135,34 @@ def against_what_happened(
         titles.append(f"{horizon:g} s ahead [m]")
         ranges.append(limits(happened_m, mean - sigma, mean + sigma, share=99.8))
     return {"data": data, "layout": layout(520, **stacked(titles, ranges, end_s))}
+
+
+def scatter(made: Forecasts, happened: Column) -> Figure:
+    """Return forecasts at 1, 2 and 3 s over what happened, with their 95 % intervals, around the line of equality."""
+    data: list[Trace] = []
+    axes: dict[str, Any] = {}
+    reach = limits(happened.values[:, 0], share=100.0) or (-1.0, 1.0)
+    for i, horizon in enumerate(SHOWN_HORIZONS_S):
+        k = int(np.argmin(np.abs(made.horizon_s - horizon)))
+        seen = happened.at(made.origin_ns + round(made.horizon_s[k] * 1e9))[:, 0]
+        known = np.isfinite(seen) & np.isfinite(made.sigma_m[:, k])
+        mean, sigma = made.heave_m[known, k], WIDTH_95 * made.sigma_m[known, k]
+        ends = np.array(reach)
+        data.append(line(ends, ends, "equal", GREY, i + 1, legend=i == 0, width=1, dash="dot"))
+        whiskers = {
+            "type": "data", "array": sigma.astype(np.float32), "thickness": 1, "width": 0,
+            "color": WHISKERS,
+        }  # fmt: skip
+        dots = points(seen[known], mean, "forecast ± 95 %", AXES[1], i + 1, legend=i == 0, size=5)
+        data.append(dots | {"error_y": whiskers})
+        suffix = "" if i == 0 else str(i + 1)
+        left = i * 0.355
+        title = f"what came {horizon:g} s later [m]"
+        axes[f"xaxis{suffix}"] = axis(
+            title, domain=[left, left + 0.29], anchor=f"y{suffix}", range=list(reach)
+        )
+        axes[f"yaxis{suffix}"] = axis("forecast [m]" if i == 0 else "", anchor=f"x{suffix}")
+    return {"data": data, "layout": layout(380, hovermode="closest", **axes)}
 
 
 def skill(made: Forecasts, scores: Scores | None) -> Figure:

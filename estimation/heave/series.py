@@ -12,7 +12,8 @@ Array = NDArray[np.float64]
 WINDOW_S = 120.0
 BIN_S = 0.125
 SMALLEST_NOISE = 1e-5
-"""Smallest sigma of a bin over the range of the series: below it the arithmetic has no digits left."""
+"""Smallest sigma of a bin over the range of the series, or 1 m where that is less: below it the arithmetic has no
+digits left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +93,7 @@ def cut_window(
     samples = len(t)
     if bin_s > 0:
         t, value, variance = _average(t, value, variance, bin_s)
-    variance = np.maximum(variance, SMALLEST_NOISE**2 * float(np.ptp(value)) ** 2)
+    variance = np.maximum(variance, SMALLEST_NOISE**2 * max(1.0, float(np.ptp(value))) ** 2)
     weight = 1.0 / variance
     offset = float(np.sum(weight * value) / np.sum(weight))
     return Window(t, value - offset, variance, offset, span, max(interval, bin_s), samples, dropped, last)

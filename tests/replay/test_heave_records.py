@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from deckfix.cli import main
 from estimation import heave
 
 Array = NDArray[np.float64]
@@ -55,3 +57,22 @@ def test_period_of_a_floating_section(data_dir: Path) -> None:
         model = heave.fit(t[seen], value[seen], 0.0005, settings=settings)
         assert model.dominant_period_s == pytest.approx(1.16, rel=0.02)
         assert 1.5 < model.noise_scale < 4.0
+
+
+def test_the_command_gives_the_buoys_own_height_and_period(data_dir: Path, tmp_path: Path) -> None:
+    """Three half-hours against Datawell's own spectra, whose half-hours are not quite the same: the mean of Hs over
+    Hm0 within 5 %, each peak period (theirs is one bin of a raw spectrum) within 20 %."""
+    folder = data_dir / "waverider"
+    with (folder / "buoy_2005-07.his").open() as lines:
+        spectra = [row for row in csv.reader(lines)]
+    ratios = []
+    for hour in ("02", "06", "10"):
+        summary = tmp_path / f"{hour}.json"
+        record = folder / f"buoy_2005-07-01T{hour}h00Z.raw"
+        told = ["--rate", "1.28", "--heave", "2", "--unit", "cm", "--json", str(summary)]
+        assert main(["heave", str(record), *told]) == 0
+        whole = json.loads(summary.read_text(encoding="utf-8"))["whole"]
+        datawell = next(row for row in spectra if row[0] >= f"2005-07-01T{hour}:00")
+        ratios.append(whole["hs_m"] / (float(datawell[5]) / 100.0))
+        assert whole["tp_s"] == pytest.approx(float(datawell[1]), rel=0.20)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)

@@ -249,9 +249,11 @@ def test_no_motion_is_no_heave() -> None:
     assert mean == pytest.approx(np.ones(len(AHEAD)), abs=0.01)
     assert np.all(np.sqrt(variance) < 0.01)
     assert still.quiescent(0.0, 5.0, rate_limit_mps=0.1) > 0.95
-    constant = heave.fit(t, np.full(len(t), 2.5), 0.03)
-    assert constant.forecast(1.0)[0] == pytest.approx(2.5, abs=1e-6)
-    assert np.all(np.isfinite(constant.forecast(AHEAD)[1]))
+    for sigma in (0.03, 1e-3, 1e-5, 1e-8):
+        constant = heave.fit(t, np.full(len(t), 2.5), sigma)
+        assert constant.forecast(1.0)[0] == pytest.approx(2.5, abs=1e-6)
+        assert np.all(np.isfinite(constant.forecast(AHEAD)[1]))
+        assert constant.sd_m < max(sigma, 1e-5)
 
 
 def test_gap_nan_trend_and_wrong_sigma_do_not_diverge() -> None:
