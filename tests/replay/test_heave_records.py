@@ -64,7 +64,7 @@ def test_the_command_gives_the_buoys_own_height_and_period(data_dir: Path, tmp_p
     Hm0 within 5 %, each peak period (theirs is one bin of a raw spectrum) within 20 %."""
     folder = data_dir / "waverider"
     with (folder / "buoy_2005-07.his").open() as lines:
-        spectra = [row for row in csv.reader(lines)]
+        spectra = list(csv.reader(lines))
     ratios = []
     for hour in ("02", "06", "10"):
         summary = tmp_path / f"{hour}.json"
