@@ -2,15 +2,18 @@
 
     python benchmarks/ship_section.py
 
-A camera tracked heave and roll, two accelerometers on the section felt both; the camera's stamps are known to be off
-by an amount that nobody stated. The heave model of ``estimation.heave`` is fitted to heave and roll as the camera saw
-them and differentiated twice; each accelerometer is explained by both, with free factors, for every offset:
+A camera tracked heave and roll; two accelerometers, to starboard and to port, felt both. The camera's stamps are known
+to be off by an amount that nobody stated. The heave model of ``estimation.heave`` is fitted to heave and to roll as the
+camera saw them and differentiated twice. Half the sum of the accelerometers is the heave's acceleration, half their
+difference the roll's times a lever arm:
 
-    acc(t) = a z''(t + latency) + b roll''(t + latency) + c + noise
+    (sb + ps) / 2 = a z''(t + latency) + noise, a > 0        (sb - ps) / 2 = b roll''(t + latency) + noise
 
-The latency is positive where the camera's content is older than its stamp, as everywhere: t_content = t_stamp -
-latency. Waves of one period look the same a whole period later: the likelihood has a peak at every period, and only the
-slow change of the waves' height tells them apart. All peaks are printed with their probability (flat prior).
+Were both mixed freely, two motions a quarter of a period apart could imitate any delay. The latency is positive where
+the camera's content is older than its stamp, as everywhere: t_content = t_stamp - latency. Waves of one period look
+the same a whole period later: the likelihood has a peak at every period, and only the slow change of the waves' height
+tells them apart. All peaks are printed with their probability (flat prior). A factor a near 1 says that camera and
+accelerometers agree on the size of the motion.
 """
 
 from __future__ import annotations
@@ -47,46 +50,53 @@ class Peak:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Log likelihood over the latency, its peaks (best first), and the share of the variance that is left there."""
+    """Log likelihood over the latency, its peaks (best first), and there the factor of heave and the share of the
+    variance of heave and of roll that is left."""
 
     latency_s: Array
     log_likelihood: Array
     peaks: list[Peak]
-    unexplained: float
+    factor: float
+    unexplained: tuple[float, float]
 
 
-def second_derivative(model: heave.HeaveModel, t_s: Array) -> Array:
-    """Return the acceleration of a model's harmonics at times of its series (n,)."""
-    frequency = model.frequency_hz
-    omega = 2.0 * np.pi * frequency
+def second_derivatives(model: heave.HeaveModel, t_s: Array, latency_s: Array) -> Array:
+    """Return the acceleration (n, k) of a model's harmonics at times (n,) of its series, each latency (k,) later."""
+    omega = 2.0 * np.pi * model.frequency_hz
+    m = len(omega)
+    a, b = (omega**2 * part for part in (model.coefficients.mean[:m], model.coefficients.mean[m : 2 * m]))
     angle = np.outer(t_s - model.last_s, omega)
-    m = len(frequency)
-    mean = model.coefficients.mean
-    out: Array = -(np.cos(angle) @ (omega**2 * mean[:m])) - np.sin(angle) @ (omega**2 * mean[m : 2 * m])
+    turn = np.outer(omega, latency_s)
+    along = a[:, None] * np.cos(turn) + b[:, None] * np.sin(turn)
+    across = b[:, None] * np.cos(turn) - a[:, None] * np.sin(turn)
+    out: Array = -(np.cos(angle) @ along) - np.sin(angle) @ across
     return out
 
 
-def profile(t_s: Array, accelerations: list[Array], models: list[heave.HeaveModel]) -> Profile:
-    """Return the profile of the likelihood over the latency, factors and noise maximised for each."""
+def profile(t_s: Array, measured: list[Array], models: list[heave.HeaveModel]) -> Profile:
+    """Return the profile of the likelihood over the latency, factors and noise maximised for each.
+
+    ``measured`` and ``models`` are in pairs, heave first, whose factor must be positive.
+    """
     grid = np.arange(-REACH_S, REACH_S + STEP_S / 2, STEP_S)
-    left = np.empty((len(accelerations), len(grid)))
-    for k, latency in enumerate(grid):
-        columns = [second_derivative(model, t_s + latency) for model in models]
-        design = np.column_stack([*columns, np.ones(len(t_s))])
-        for c, measured in enumerate(accelerations):
-            left[c, k] = np.sum(residual(design, measured) ** 2)
+    factor = np.empty((len(models), len(grid)))
+    left = np.empty((len(models), len(grid)))
+    expected = []
+    for row, (model, y) in enumerate(zip(models, measured, strict=True)):
+        x = second_derivatives(model, t_s, grid)
+        x = x - x.mean(axis=0)
+        expected.append(x)
+        factor[row] = (x.T @ y) / np.sum(x * x, axis=0)
+        if row == 0:
+            factor[row] = np.maximum(factor[row], 0.0)
+        left[row] = np.sum((y[:, None] - factor[row] * x) ** 2, axis=0)
     best = int(np.argmin(np.log(left).sum(axis=0)))
-    columns = [second_derivative(model, t_s + grid[best]) for model in models]
-    design = np.column_stack([*columns, np.ones(len(t_s))])
-    counts = [independent(residual(design, measured)) for measured in accelerations]
+    counts = [independent(y - factor[row, best] * expected[row][:, best]) for row, y in enumerate(measured)]
     value = -0.5 * sum(n * np.log(row) for n, row in zip(counts, left, strict=True))
-    total = sum(float(np.sum((a - a.mean()) ** 2)) for a in accelerations)
-    return Profile(grid, value, _peaks(grid, value), float(left[:, best].sum()) / total)
-
-
-def residual(design: Array, measured: Array) -> Array:
-    """Return what the best factors leave."""
-    return np.asarray(measured - design @ np.linalg.lstsq(design, measured, rcond=None)[0], np.float64)
+    share = left[:, best] / [float(y @ y) for y in measured]
+    return Profile(
+        grid, value, _peaks(grid, value), float(factor[0, best]), (float(share[0]), float(share[1]))
+    )
 
 
 def independent(values: Array) -> float:
@@ -127,11 +137,13 @@ def examine(path: Path) -> tuple[heave.HeaveModel, Profile, Array]:
         for name, sigma in (("Heave [m]", 5e-4), ("Roll [rad]", 2e-3))
     ]
     inside = (t >= t[0] + MARGIN_S) & (t <= t[-1] - MARGIN_S)
-    measured = [columns[name][use][::every][inside] for name in ACCELEROMETERS]
+    starboard, port = (columns[name][use][::every][inside] for name in ACCELEROMETERS)
+    measured = [0.5 * (starboard + port), 0.5 * (starboard - port)]
+    measured = [y - y.mean() for y in measured]
     whole = profile(t[inside], measured, models)
     parts = []
     for rows in np.array_split(np.arange(int(inside.sum())), PARTS):
-        part = profile(t[inside][rows], [a[rows] for a in measured], models)
+        part = profile(t[inside][rows], [y[rows] - y[rows].mean() for y in measured], models)
         near = min(part.peaks, key=lambda p: abs(p.latency_s - whole.peaks[0].latency_s))
         parts.append(near.latency_s)
     return models[0], whole, np.array(parts)
@@ -158,9 +170,14 @@ def main() -> int:
         best = found.peaks[0]
         print(
             f"  latency of the camera {1e3 * best.latency_s:+.1f} ms, 1 sigma {1e3 * best.sigma_s:.1f} ms "
-            f"(positive: the content is older than its stamp); {100 * found.unexplained:.1f} % of the variance left"
+            f"(positive: the content is older than its stamp); factor {found.factor:.2f}, "
+            f"{100 * found.unexplained[0]:.1f} % of heave and {100 * found.unexplained[1]:.1f} % of roll unexplained"
         )
-        print(f"  by thirds of the record [ms]: {', '.join(f'{1e3 * p:+.1f}' for p in parts)}")
+        scatter = 1e3 * float(np.std(parts, ddof=1)) / np.sqrt(PARTS)
+        print(
+            f"  by thirds of the record {', '.join(f'{1e3 * p:+.1f}' for p in parts)} ms: 1 sigma {scatter:.1f} ms by "
+            "their scatter"
+        )
         print("  ambiguous by whole periods of the waves; every peak of the likelihood (flat prior):")
         print(f"    {'latency [ms]':>13} {'periods':>8} {'log-likelihood':>15} {'probability':>12}")
         for peak in sorted(found.peaks, key=lambda p: p.latency_s):
