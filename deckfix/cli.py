@@ -30,6 +30,17 @@ _ENGINE = click.option(
     "--engine", type=click.Choice(["auto", "filterpy", "compiled"]), default="auto", show_default=True,
     help="auto takes compiled where numba is installed.",
 )  # fmt: skip
+_JOBS = click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Processes on this machine (default: one for each core).",
+)
+_SCHEDULER = click.option(
+    "--scheduler",
+    metavar="URL",
+    help="Work on a Dask cluster instead: the address of its scheduler, tcp://HOST:8786.",
+)
 _FORCE = click.option("--force", is_flag=True, help="Overwrite output files that exist.")
 
 
@@ -45,6 +56,7 @@ _ORDER = (
     "detect",
     "target",
     "calibrate",
+    "fleet",
 )
 
 
@@ -180,6 +192,36 @@ def simulate(scenario: str, output: str, seed: int | None, force: bool) -> None:
     from deckfix.demo import simulate_flight
 
     _say(simulate_flight(scenario, output, seed=seed, force=force))
+
+
+@deckfix.command()
+@click.argument("folder", metavar="DIR")
+@click.option(
+    "-o", "--output", default="fleet", show_default=True, metavar="OUT", help="The folder of the results."
+)
+@click.option(
+    "--config",
+    "config_path",
+    metavar="C.toml",
+    help="Configuration (default: each log's own, else built in).",
+)
+@click.option("--reports/--no-reports", default=True, help="Write each flight's report (about 5 MB each).")
+@_ENGINE
+@_JOBS
+@_SCHEDULER
+@_FORCE
+def fleet(
+    folder: str, output: str, config_path: str | None, reports: bool, engine: str, jobs: int | None,
+    scheduler: str | None, force: bool,
+) -> None:  # fmt: skip
+    """Replay every flight below a folder: one row each, and a page that links the reports.
+
+    What was done before is not done again; --force replays all.
+    """
+    from deckfix.fleet import FleetOptions, run_fleet
+
+    chosen: Any = engine
+    _say(run_fleet(folder, output, FleetOptions(config_path, chosen, reports, jobs, scheduler, force)))
 
 
 @deckfix.command()
