@@ -19,6 +19,7 @@ import click
 from deckfix._version import __version__
 from deckfix.cli_detect import detect
 from deckfix.cli_heave import heave
+from deckfix.cli_sync import sync
 from deckfix.cli_vision import calibrate, target
 
 # The matrices here are small: threads of the linear algebra library only wait for each other. It reads this when
@@ -56,6 +57,7 @@ _ORDER = (
     "detect",
     "target",
     "calibrate",
+    "sync",
     "fleet",
 )
 
@@ -252,6 +254,7 @@ deckfix.add_command(detect)
 deckfix.add_command(target)
 deckfix.add_command(calibrate)
 deckfix.add_command(heave)
+deckfix.add_command(sync)
 
 
 def _say(text: str) -> None:

@@ -198,7 +198,7 @@ class Pipeline:
         stamp = self.estimator.inertial_time_ns(event.clock, event.stamp_ns)
         if stamp is None:
             return None
-        age_s = self.config.vision.latency_s
+        age_s = self.estimator.config.vision.latency_s
         if self.config.platform.use and self._estimates:
             age_s += float(self._estimates[-1].nominal[CL0])
         return stamp - round(age_s * 1e9)

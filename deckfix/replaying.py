@@ -31,7 +31,7 @@ from deckfix.streams import streams, vibration_mps2
 from estimation.config import Config, dump_config, load_config, parse_config
 from estimation.estimator import EngineName, LandingEstimator
 from estimation.events import AUTOPILOT, EventBatch, Kind
-from estimation.output import Facts, Run
+from estimation.output import Facts, Run, with_facts
 from estimation.state import CAMERA_LATENCY, NOMINAL
 
 if TYPE_CHECKING:
@@ -94,6 +94,9 @@ def facts(flight: Flight) -> Facts:
     return Facts(
         imu_latency_s=_stated(flight, "/imu", "latency_s") or 0.0,
         declination_rad=_stated(flight, "/magnetic_field", "autopilot_declination_rad"),
+        vision_by_arrival=any(
+            i.metadata.get("stamps") == "arrival" for i in flight.topics.get("/vision/fix", [])
+        ),
     )
 
 
@@ -112,6 +115,8 @@ def present(
     flight: Flight, run: Run, batch: EventBatch, config: Config, source: str, wall_s: float = 0.0
 ) -> Result:
     """Return the result of a run over a log's events, compared with the references in the log."""
+    text = dump_config(config)
+    config = with_facts(config, facts(flight))
     imu = batch.rows["stamp_ns"][batch.rows["kind"] == int(Kind.IMU)]
     start_ns, end_ns = int(imu.min()), int(imu.max())
     offsets = flight.clock_offsets_ns
@@ -126,7 +131,7 @@ def present(
         start_ns=start_ns,
         end_ns=end_ns,
         judged=window(start_ns, end_ns, contact),
-        config_text=dump_config(config),
+        config_text=text,
         config_source=source,
         wall_s=wall_s,
         truth=truth,

@@ -141,6 +141,7 @@ class ClockSummary:
     status: SyncStatus
     offset_ns: int
     skew_ppm: float
+    skew_sigma_ppm: float
     sigma_ns: float
     asymmetry_bound_ns: float
     steps: int
@@ -342,6 +343,7 @@ class ClockBank:
                 worst,
                 guess - at_ns,
                 skew,
+                math.sqrt(sum(p.skew_sigma_ppm**2 for p in pairs)),
                 reading.sigma_ns if reading else math.inf,
                 sum(p.asymmetry_bound_ns for p in pairs),
                 sum(p.steps for p in pairs),
@@ -355,4 +357,6 @@ class ClockBank:
         offset = at_ns - by_arrivals.time_ns
         arrival_ns = own.to_reference(at_ns)
         sigma = math.hypot(own.sigma_ns(arrival_ns), other.sigma_ns(arrival_ns) if other else 0.0)
-        return ClockSummary(clock, "arrivals", SyncStatus.ACQUIRING, offset, 0.0, sigma, math.inf, steps, 0)
+        return ClockSummary(
+            clock, "arrivals", SyncStatus.ACQUIRING, offset, 0.0, math.inf, sigma, math.inf, steps, 0
+        )

@@ -223,6 +223,16 @@ class VisionConfig(_Table, frozen=True):
     latency_sigma_s: Annotated[
         float, _positive("1-sigma of that age; the state that learns it stays within 0 to 0.15 s", "s")
     ] = 0.02
+    arrival_latency_s: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=0.15,
+            description="the same where the log says that fixes are stamped with their arrival: age at arrival",
+            extra={"unit": "s"},
+        ),
+    ] = 0.06
+    arrival_latency_sigma_s: Annotated[float, _positive("1-sigma of that", "s")] = 0.05
     latency_walk: Annotated[
         float, _not_negative("random walk of the age; 3e-5: 0.1 ms after 10 s", "s/rts")
     ] = 3e-5

@@ -36,7 +36,7 @@ from estimation.history import Engine, History
 from estimation.learning import HeaveLearner
 from estimation.ledger import Ledger
 from estimation.outcome import Outcome
-from estimation.output import Facts, Output, Run, estimate_at
+from estimation.output import Facts, Output, Run, estimate_at, with_facts
 from estimation.parameters import Site, pack_parameters
 from estimation.rows import HEAVE_MODEL, PENDING, Estimates, FilterState, Int, Rows
 from estimation.screening import malformed
@@ -90,7 +90,7 @@ class LandingEstimator:
 
     def __post_init__(self) -> None:
         """Raise ``ConfigError`` for an engine that is not there."""
-        c = self.config
+        c = self.config = with_facts(self.config, self.facts)
         self.layout = Layout.of(c)
         self.engine_name = _choose(self.engine)
         self._history = History(int(c.filter.window_s * 1e9))

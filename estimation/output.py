@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from estimation.clockbank import ClockSummary
+from estimation.config import Config
 from estimation.frames import Array
 from estimation.heave.model import HeaveModel
 from estimation.outcome import Outcome
@@ -39,11 +41,21 @@ class Facts:
     """What the source of the events knows beforehand, used where the configuration leaves it open.
 
     ``imu_latency_s`` is the age of an inertial sample at its stamp (filter delay); ``declination_rad`` is east
-    positive.
+    positive; ``vision_by_arrival`` says that vision fixes have no stamps of their own but those of their arrival.
     """
 
     imu_latency_s: float = 0.0
     declination_rad: float | None = None
+    vision_by_arrival: bool = False
+
+
+def with_facts(config: Config, facts: Facts) -> Config:
+    """Return the configuration as it applies: fixes that are stamped with their arrival have the age of that."""
+    if not facts.vision_by_arrival:
+        return config
+    v = config.vision
+    age = {"latency_s": v.arrival_latency_s, "latency_sigma_s": v.arrival_latency_sigma_s}
+    return replace(config, vision=replace(v, **age))
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,8 @@ from logs.vehicles import Autopilot
 _BODY_FRAMES = (8, 12)
 _LONGEST_TRIP_NS = 1_000_000_000
 _LATEST_CLOCK_NS = 4_000_000_000_000_000_000
+ARRIVAL = "arrival"
+"""Value of a channel's entry ``stamps`` where these tell nothing but when a fix arrived (else ``own``)."""
 _EARLIEST_NS, _LATEST_NS = -100_000_000, 5_000_000_000
 
 
@@ -112,8 +114,9 @@ def _fixes(autopilot: Autopilot, out: Companion) -> list[Series]:
     stamps = to_ns(found.data["time_usec"])
     usable &= near(stamps, int(np.median(stamps[usable])))
     found, body = found[usable], body[usable]
-    stamps, clock = _stamps(stamps[usable], found.arrival_ns, autopilot, out)
+    stamps, clock, own = _stamps(stamps[usable], found.arrival_ns, autopilot, out)
     metadata = {
+        "stamps": "own" if own else ARRIVAL,
         "message": "LANDING_TARGET",
         "mounting": "nominal: looking straight down, image top forward",
         "covariance": "not given by the source",
@@ -121,8 +124,11 @@ def _fixes(autopilot: Autopilot, out: Companion) -> list[Series]:
     return [vision_series(Times(stamps, found.arrival_ns, clock), body @ R_CB_NOMINAL.T, metadata)]
 
 
-def _stamps(stamps: Stamps, arrivals: Stamps, autopilot: Autopilot, out: Companion) -> tuple[Stamps, str]:
-    """Return the fixes' stamps and their clock: the one by which they arrive soon after their stamp."""
+def _stamps(
+    stamps: Stamps, arrivals: Stamps, autopilot: Autopilot, out: Companion
+) -> tuple[Stamps, str, bool]:
+    """Return the fixes' stamps, their clock (the one by which they arrive soon after their stamp), and whether the
+    stamps tell more than when a fix arrived."""
     constants = {"companion": out.offset_ns, "autopilot": autopilot.offset_ns, "utc": 0}
     for clock, constant in constants.items():
         if constant is None or not stamps.any():
@@ -131,16 +137,16 @@ def _stamps(stamps: Stamps, arrivals: Stamps, autopilot: Autopilot, out: Compani
         if not _EARLIEST_NS <= delay <= _LATEST_NS:
             continue
         if clock != "utc":
-            return stamps, clock
+            return stamps, clock, True
         out.offset_ns = out.offset_ns or 0
-        return stamps - out.offset_ns, "companion"
+        return stamps - out.offset_ns, "companion", True
     if stamps.any() and out.offset_ns is None:
         out.offset_ns = int(np.sort(arrivals - stamps)[len(stamps) // 2])
         out.problems.append(
             "the vision fixes' clock is tied to no other in this log (no TIMESYNC): it is taken to be "
             "right when they arrived, so their latency is unknown"
         )
-        return stamps, "companion"
+        return stamps, "companion", False
     out.problems.append("the vision fixes carry no usable time: they are stamped with their arrival")
     out.offset_ns = out.offset_ns or 0
-    return arrivals - out.offset_ns, "companion"
+    return arrivals - out.offset_ns, "companion", False

@@ -31,7 +31,7 @@ from simulation.jets import Array
 from simulation.platform import Platform, Raft
 from simulation.sea import BEAUFORT_WIND_MPS, Sea, Wave, beaufort
 from simulation.sensors import CLOCKS, Clock, Place, Sensors, SlowError, Streams
-from simulation.trajectory import Plan, Trajectory, Wind, quaternions
+from simulation.trajectory import Plan, Rock, Trajectory, Wind, quaternions
 
 TRUTH_RATE_HZ = 50.0
 
@@ -77,6 +77,7 @@ class Scenario(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=
     sea: WavesTable = WavesTable(beaufort=2)
     raft: Raft = Raft()
     wind: WindTable = WindTable()
+    rock: Rock | None = None
     streams: Streams = Streams()
     clocks: dict[str, Clock] = {}
     vibration_mps2: float = 0.0
@@ -211,7 +212,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> SimulatedFlight:
     speed = wind_speed_mps(wind, scenario.sea)
     blow = Wind.draw(speed, math.radians(wind.direction_deg), wind.sway_m, air)
     gravity = normal_gravity(float(place.origin[0]), float(place.origin[2]))
-    trajectory = Trajectory(scenario.plan, blow, platform, gravity)
+    trajectory = Trajectory(scenario.plan, blow, platform, gravity, rock=scenario.rock)
     sensors = Sensors(scenario.drawn, scenario.streams, scenario.clocks, place, scenario.vibration_mps2)
     drawn = sensors.draw(trajectory, sensing)
     return SimulatedFlight(scenario, chosen, trajectory, place, drawn.batch, drawn.slow)

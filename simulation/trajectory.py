@@ -79,6 +79,29 @@ class Plan(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
         return self.bounds_s["descent"][1]
 
 
+class Rock(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """Rocking on purpose: for ``duration_s`` from ``start_s`` on [s] the vehicle goes round in a small circle,
+    tilted by ``tilt_deg``, once in ``period_s``. It is let in and out over a second at both ends.
+    """
+
+    start_s: float = 0.0
+    duration_s: float = 0.0
+    tilt_deg: float = 6.0
+    period_s: float = 1.2
+
+    def motion(self, t_s: Array, gravity_mps2: float) -> Array:
+        """Return the displacement, a jet (4, n, 3) [m]."""
+        omega = 2.0 * np.pi / self.period_s
+        radius = gravity_mps2 * np.tan(np.radians(self.tilt_deg)) / omega**2
+        circle = Tones(
+            radius * np.array([[1.0], [1.0], [0.0]]),
+            np.full((3, 1), omega),
+            np.array([[0.0], [np.pi / 2.0], [0.0]]),
+        )
+        shown = step(t_s, self.start_s, 1.0) - step(t_s, self.start_s + self.duration_s - 1.0, 1.0)
+        return product(shown, circle.motion(t_s))
+
+
 def _none() -> Tones:
     return Tones(np.zeros((3, 0)), np.zeros((3, 0)), np.zeros((3, 0)))
 
@@ -133,13 +156,16 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """A flight by plan in a wind to a platform. ``drag_per_s`` is the rotors' linear drag over mass."""
+    """A flight by plan in a wind to a platform, rocking where asked to. ``drag_per_s`` is the rotors' linear drag over
+    mass.
+    """
 
     plan: Plan
     wind: Wind
     platform: Platform
     gravity_mps2: float
     drag_per_s: float = 0.25
+    rock: Rock | None = None
 
     def phase(self, t_s: Array) -> NDArray[np.int64]:
         """Return the phase of each time, as an index of ``PHASES``."""
@@ -159,6 +185,8 @@ class Trajectory:
         mean_deck = constant(t_s, (0.0, 0.0, -self.platform.raft.freeboard_m))
         position = self._path(t_s)
         position += product(airborne, self.wind.sway.motion(t_s)) + product(ride, deck.position - mean_deck)
+        if self.rock is not None:
+            position += self.rock.motion(t_s, self.gravity_mps2)
         relative_wind = constant(t_s, self.wind.mean_mps) + self.wind.gust.motion(t_s)
         force = position[2] - [0.0, 0.0, self.gravity_mps2]
         force_rate = position[3]

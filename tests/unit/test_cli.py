@@ -37,7 +37,7 @@ def failure(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, s
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["import"], ["info"], ["replay"], ["report"], ["export"], ["doctor"]]
+    "command", [[], ["import"], ["info"], ["replay"], ["report"], ["export"], ["doctor"], ["sync"]]
 )
 def test_help_loads_nothing_heavy(command: list[str]) -> None:
     code = (

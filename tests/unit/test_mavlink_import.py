@@ -157,6 +157,18 @@ def test_the_clock_of_vision_fixes_is_found(tmp_path: Path, shift_us: int, clock
             fields["time_usec"] += shift_us
     (fixes,) = imported(tmp_path, lb.telemetry(items)).find("/vision/fix")
     assert fixes.clock == clock
+    assert fixes.metadata["stamps"] == "own"
+
+
+def test_fixes_without_a_time_are_said_to_be_stamped_by_arrival(tmp_path: Path) -> None:
+    items = lb.telemetry_flight(seconds=4.0)
+    for _, name, fields, _ in items:
+        if name == "LANDING_TARGET":
+            fields["time_usec"] = 0
+    recording = imported(tmp_path, lb.telemetry(items))
+    (fixes,) = recording.find("/vision/fix")
+    assert fixes.metadata["stamps"] == "arrival"
+    assert any("stamped with their arrival" in p for p in recording.problems)
 
 
 def test_of_two_vehicles_the_one_with_most_imu_data_is_taken(tmp_path: Path) -> None:
