@@ -38,7 +38,7 @@ def check_replay(
     if result.source is None:
         raise ValueError("this result did not come from a log")
     path = Path(result.source.path)
-    again = replay(path, config, engine)
+    again = replay(path, config, engine, smooth=result.smoothed is not None)
     said = []
     with tempfile.TemporaryDirectory(prefix="deckfix-") as folder:
         first, second = Path(folder) / "first.mcap", Path(folder) / "second.mcap"

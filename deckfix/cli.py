@@ -119,6 +119,9 @@ def info(file: str) -> None:
 @click.option(
     "--check", is_flag=True, help="Replay twice and compare with recorded estimates: bytes must be equal."
 )
+@click.option(
+    "--smooth", is_flag=True, help="Smooth as well: /smoothed topics, from what came before and after."
+)
 @_FORCE
 def replay(
     file: str,
@@ -128,6 +131,7 @@ def replay(
     config_path: str | None,
     engine: str,
     check: bool,
+    smooth: bool,
     force: bool,
 ) -> None:
     """Run the estimator over a log."""
@@ -135,7 +139,7 @@ def replay(
 
     text, equal = replay_command(
         file, output=output, report=report_path, json_path=json_path, config=config_path, engine=engine,
-        check=check, force=force,
+        check=check, force=force, smooth=smooth,
     )  # fmt: skip
     _say(text)
     if not equal:

@@ -26,6 +26,7 @@ def replay_command(
     engine: str,
     check: bool,
     force: bool,
+    smooth: bool = False,
 ) -> tuple[str, bool]:
     """Replay a log, write what was asked for, and return the text to show and whether the check held."""
     from deckfix.replaying import replay
@@ -38,7 +39,7 @@ def replay_command(
         check_output(path, force=force, inputs=inputs)
     _distinct(written)
     with working(f"replaying {Path(file).name}"):
-        result = replay(file, config, cast("EngineName", engine))
+        result = replay(file, config, cast("EngineName", engine), smooth=smooth)
     if output:
         result.write(output, force=force, inputs=inputs)
     if report:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from logs.recording import Series
     from logs.writer import FlightWriter
 
-OURS = ("/estimate/", "/fusion", "/heave/")
+OURS = ("/estimate/", "/smoothed/", "/fusion", "/heave/")
 """Topics that a replay writes; those of an earlier replay are not copied."""
 SOFTWARE = "deckfix.estimate"
 """Metadata record that tells what made the estimates."""
@@ -54,7 +54,8 @@ def write(
         writer.add_attachment(CONFIG_NAME, "application/toml", result.config_text.encode())
         writer.add_metadata(SOFTWARE, {"software": f"deckfix {__version__}", "engine": result.run.engine})
         utc_offset_ns = flight.clock_offsets_ns.get(AUTOPILOT, 0)
-        writer.write_series(*estimate_series(result.run, utc_offset_ns, result.forecasts))
+        series = estimate_series(result.run, utc_offset_ns, result.forecasts)
+        writer.write_series(*series, *smoothed_series(result.smoothed, utc_offset_ns))
 
 
 def copy_source(flight: Flight, writer: FlightWriter) -> None:
@@ -94,15 +95,13 @@ def estimate_series(run: Run, utc_offset_ns: int, made: Forecasts) -> list[Serie
     Fusion records are stamped with the time of their content and logged at their arrival; ``utc_offset_ns``
     takes the inertial clock to UTC.
     """
-    from logs.estimates import fusion_series, odometry_series, state_series
+    from logs.estimates import fusion_series, state_series
 
     out = []
     if len(run.t_ns):
         arrival = run.t_ns + utc_offset_ns
-        pose = (run.position_m, run.velocity_mps, run.quaternion, run.covariance)
-        out.append(odometry_series("/estimate/odometry", run.t_ns, arrival, *pose))
+        out.extend(_pose_series("/estimate", run, arrival))
         out.append(state_series(run.state_names, run.t_ns, arrival, state_values(run), run.sigma))
-        out.extend(_deck_series(run, arrival))
     out.extend(_heave_series(run, utc_offset_ns, made))
     for index in np.unique(run.records["sensor"]):
         r = run.records[run.records["sensor"] == index]
@@ -113,12 +112,21 @@ def estimate_series(run: Run, utc_offset_ns: int, made: Forecasts) -> list[Serie
     return out
 
 
-def _deck_series(run: Run, arrival: NDArray[np.int64]) -> list[Series]:
-    """Return the vehicle relative to the platform, and the platform, where its states were on."""
+def smoothed_series(run: Run | None, utc_offset_ns: int) -> list[Series]:
+    """Return the topics of smoothed estimates, ``/smoothed/...``, logged at their own times; none for None."""
+    return (
+        [] if run is None or not len(run.t_ns) else _pose_series("/smoothed", run, run.t_ns + utc_offset_ns)
+    )
+
+
+def _pose_series(root: str, run: Run, arrival: NDArray[np.int64]) -> list[Series]:
+    """Return the vehicle, and where its states were on the vehicle relative to the platform and the platform."""
     from logs.estimates import odometry_series
 
+    pose = (run.position_m, run.velocity_mps, run.quaternion, run.covariance)
+    vehicle = odometry_series(f"{root}/odometry", run.t_ns, arrival, *pose)
     if not run.deck.shape[1]:
-        return []
+        return [vehicle]
     n, covariance, deck = len(run.t_ns), run.covariance.copy(), run.deck_covariance
     covariance[:, :6, :6] = deck[:, :6, :6]
     relative = (run.deck[:, :3], run.deck[:, 3:6], run.quaternion, covariance)
@@ -131,8 +139,9 @@ def _deck_series(run: Run, arrival: NDArray[np.int64]) -> list[Series]:
         k = run.state_names.index(f"platform_offset.{name}")
         own[:, axis, axis] = run.sigma[:, k] ** 2
     return [
-        odometry_series("/estimate/relative", run.t_ns, arrival, *relative),
-        odometry_series("/estimate/platform", run.t_ns, arrival, place, speed, level, own),
+        vehicle,
+        odometry_series(f"{root}/relative", run.t_ns, arrival, *relative),
+        odometry_series(f"{root}/platform", run.t_ns, arrival, place, speed, level, own),
     ]
 
 

@@ -11,6 +11,7 @@ from deckfix.plotting import (
     AUTOPILOT,
     GREY,
     OURS,
+    SMOOTHED,
     TRUTH,
     Array,
     Figure,
@@ -146,6 +147,10 @@ def _others(result: Result) -> list[tuple[str, tuple[Array, Array], str, dict[st
         )
         shifted = own.values + np.where(np.isfinite(datum), datum, 0.0)
         out.append((name, (result.seconds_of(own.t_ns), shifted), colour, dict(style)))
+    smoothed = result.smoothed
+    if smoothed is not None and result.truth is None and len(smoothed.t_ns):
+        own_path = (result.seconds_of(smoothed.t_ns), smoothed.position_m)
+        out.append(("smoothed", own_path, SMOOTHED, {"dash": "dot"}))
     return out
 
 

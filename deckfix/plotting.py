@@ -21,6 +21,7 @@ Trace = dict[str, Any]
 OURS = "#0b5cad"
 AUTOPILOT = "#c2601a"
 TRUTH = "#1c1f23"
+SMOOTHED = "#2f7d5b"
 BAD = "#b3261e"
 AXES = ("#0b5cad", "#2a7f62", "#8a4fa3")
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', 'DejaVu Sans', Arial, sans-serif"

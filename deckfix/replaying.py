@@ -52,11 +52,16 @@ def open(path: str | Path) -> Flight:
 
 
 def replay(
-    flight: Flight | str | Path, config: Config | str | Path | None = None, engine: EngineName = "auto"
+    flight: Flight | str | Path,
+    config: Config | str | Path | None = None,
+    engine: EngineName = "auto",
+    *,
+    smooth: bool = False,
 ) -> Result:
     """Run the estimator over a log and return what came out.
 
-    ``config`` is a configuration or the path of one; without it the log's own is used, or else the default.
+    ``config`` is a configuration or the path of one; without it the log's own is used, or else the default. With
+    ``smooth`` the result has the smoothed estimates too (docs/smoothing.md).
     Raises ``logs.errors.LogError`` where the log cannot be read or holds no inertial samples, and
     ``estimation.config.ConfigError`` for a configuration or an engine that cannot be used.
     """
@@ -71,9 +76,13 @@ def replay(
             opened.path, "holds no inertial samples (/imu)", "log the IMU, or import the file that has it"
         )
     begin = time.perf_counter()
-    run = LandingEstimator(settings, engine=engine, facts=facts(opened)).run(batch)
+    estimator = LandingEstimator(settings, engine=engine, facts=facts(opened), smooth=smooth)
+    run = estimator.run(batch)
     wall_s = time.perf_counter() - begin
-    return present(opened, run, batch, settings, source, wall_s)
+    result = present(opened, run, batch, settings, source, wall_s)
+    if smooth:
+        take_smoothed(result, estimator.smoothed(run))
+    return result
 
 
 def configuration(flight: Flight, config: Config | str | Path | None) -> tuple[Config, str]:
@@ -156,6 +165,17 @@ def present(
         if autopilot is not None:
             result.at_autopilot = at_reference(run, autopilot, truth, result.judged)
     return result
+
+
+def take_smoothed(result: Result, smoothed: Run) -> None:
+    """Give a result its smoothed estimates, compared with the same references as the filter's."""
+    result.smoothed = smoothed
+    if result.truth is None or len(smoothed.t_ns) < 2:
+        return
+    own = (smoothed.t_ns, smoothed.position_m, smoothed.velocity_mps, smoothed.quaternion)
+    result.smoothed_errors = compare(*own, result.truth, result.judged, smoothed.covariance)
+    if result.platform is not None and smoothed.deck.shape[1]:
+        result.smoothed_deck_errors = compare_deck(smoothed, result.truth, result.platform, result.judged)
 
 
 def clock_blocks(run: Run, config: Config) -> dict[str, dict[str, Any]]:

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from deckfix.clock_track import ClockTrack
 from deckfix.deck_reference import DeckErrors, RawFixes, height_seen_later, true_height
 from deckfix.forecasts import HORIZONS_S, QUIET_RATE_MPS, QUIET_S, Forecasts, Scores, forecasts, judge
-from deckfix.reference import Errors, Trajectory, Window, ratio_block, rmse_block
+from deckfix.reference import (
+    Errors,
+    Trajectory,
+    Window,
+    column,
+    compare,
+    quaternion_column,
+    ratio_block,
+    rmse_block,
+)
 from deckfix.streams import Stream
 from estimation.frames import quat_to_euler_columns
 from estimation.outcome import Outcome
@@ -69,7 +78,8 @@ class Result:
     first inertial sample. ``truth_errors`` are at the estimates' times; ``at_autopilot`` at the
     autopilot's; both are None where the log holds no such reference, as ``deck_errors`` is. ``platform`` is the
     platform's truth, ``fixes`` what each vision fix says by itself, ``clock_tracks`` every other clock over time,
-    ``vision_latency_s`` the configured age of a fix. ``source`` is the log it came from, for ``write``.
+    ``vision_latency_s`` the configured age of a fix. ``smoothed`` has the smoothed estimates in ``run``'s columns, with
+    their own errors, where they were asked for. ``source`` is the log it came from, for ``write``.
     """
 
     flight: str
@@ -91,6 +101,9 @@ class Result:
     clocks: dict[str, dict[str, Any]] = field(default_factory=dict)
     clock_tracks: tuple[ClockTrack, ...] = ()
     vision_latency_s: float = 0.0
+    smoothed: Run | None = None
+    smoothed_errors: Errors | None = None
+    smoothed_deck_errors: DeckErrors | None = None
     problems: tuple[str, ...] = ()
     messages: tuple[LogMessage, ...] = ()
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -231,6 +244,8 @@ class Result:
             out["truth"] = {"odometry": rmse_block(self.truth_errors, self.judged)}
             if self.deck_errors is not None:
                 out["truth"] |= self.deck_errors.blocks()
+        if self.smoothed is not None:
+            out["smoothed"] = self._smoothed_block(self.smoothed)
         if self.at_autopilot is not None:
             ours, theirs = self.at_autopilot.ours, self.at_autopilot.autopilot
             out["autopilot"] = rmse_block(theirs, self.judged)
@@ -246,6 +261,21 @@ class Result:
             if self.forecast_scores is not None:
                 out["heave"]["forecast"] = self.forecast_scores.block()
         return out
+
+    def _smoothed_block(self, smoothed: Run) -> dict[str, Any]:
+        """Return the smoothed estimates' errors; without a truth the filter's less the smoothed ones."""
+        block: dict[str, Any] = {"estimates": len(smoothed.t_ns)}
+        if self.smoothed_errors is not None:
+            block["odometry"] = rmse_block(self.smoothed_errors, self.judged)
+            if self.smoothed_deck_errors is not None:
+                block |= self.smoothed_deck_errors.blocks()
+        elif len(smoothed.t_ns) > 1:
+            t = smoothed.t_ns
+            attitude = quaternion_column(t, smoothed.quaternion)
+            reference = Trajectory(column(t, smoothed.position_m), column(t, smoothed.velocity_mps), attitude)
+            own = (self.run.t_ns, self.run.position_m, self.run.velocity_mps, self.run.quaternion)
+            block["filter_less_smoothed"] = rmse_block(compare(*own, reference, self.judged), self.judged)
+        return block
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the estimates as a table: one row each, indexed by seconds, with every state and its sigma.

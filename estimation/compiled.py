@@ -17,6 +17,7 @@ from numba.extending import overload, register_jitable
 
 from estimation import deck, frames, models, parameters, state, update
 from estimation import rows as rows_module
+from estimation import trail as trail_module
 from estimation.codecache import jitted
 from estimation.deck import deck_output, seen_height
 from estimation.frames import Array
@@ -39,6 +40,7 @@ from estimation.rows import (
     Rows,
 )
 from estimation.state import ATTITUDE, PLATFORM_HEAVE, PLATFORM_SWAY, SIZES, Layout, Offsets, plus
+from estimation.trail import AFTER, EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.update import (
     MAX_STEP_S,
     considered,
@@ -108,9 +110,9 @@ for _module in (deck, frames, models, state, update):
             register_jitable(_function)
 
 
-def _propagate_covariance(P: Array, F: Array, Q: Array, span: Int) -> None:
-    """Replace P by F P F' + Q, using that F is the identity but for the nine columns of attitude and biases, the
-    velocity in the position, and the spans of ``_spans`` behind."""
+def _transited(F: Array, P: Array, span: Int) -> Array:
+    """Return F P, using that F is the identity but for the nine columns of attitude and biases, the velocity in the
+    position, and the spans of ``_spans`` behind."""
     n = P.shape[0]
     dt = F[0, 3]
     FP = np.empty((n, n))
@@ -131,6 +133,14 @@ def _propagate_covariance(P: Array, F: Array, Q: Array, span: Int) -> None:
             f = F[i, k]
             for j in range(n):
                 FP[i, j] += f * P[k, j]
+    return FP
+
+
+def _propagate_covariance(P: Array, F: Array, Q: Array, span: Int) -> None:
+    """Replace P by F P F' + Q, with F as in ``_transited``."""
+    n = P.shape[0]
+    dt = F[0, 3]
+    FP = _transited(F, P, span)
     for i in range(n):
         for j in range(i + 1):
             if j >= 9:
@@ -162,7 +172,7 @@ def _spans(layout: Layout) -> Int:
 
 def _propagate(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, t: int, t_imu: int, imu: Array, p: Array,
-    offsets: Offsets, F: Array, Q: Array, heave: Array, span: Int,
+    offsets: Offsets, F: Array, Q: Array, heave: Array, span: Int, chain: Array,
 ) -> Array:  # fmt: skip
     total = t - clock[0]
     if total <= 0:
@@ -176,6 +186,8 @@ def _propagate(
         mean = interpolate(imu0, clock[1], imu, t_imu, middle)
         x = transition(x, mean[:3], mean[3:], dt, extra, p, offsets, F, Q, heave)
         _propagate_covariance(P, F, Q, span)
+        if chain.shape[0] > 0:
+            chain[:, :] = _transited(F, chain, span)
     clock[0] = t
     return x
 
@@ -358,8 +370,25 @@ def _congruence(A: Array, P: Array, out: Array) -> None:
             out[i, j] = value
 
 
-for _helper in (_congruence, _determinant, _innovation_covariance, _inverse, _joseph, _reset_attitude):
+def _open(
+    t: int, x: Array, P: Array, heave: Array, trail_count: Int, trail_t: Int, trail_marks: Int, trail_x: Array,
+    trail_P: Array, trail_chain: Array, trail_heave: Array,
+) -> None:  # fmt: skip
+    """Begin a node of the trail; ``Trail.open`` in compiled code."""
+    k = trail_count[0]
+    trail_t[k] = t
+    trail_marks[k, :] = 0
+    trail_heave[k] = heave
+    for side in range(2):
+        trail_x[k, side] = x
+        trail_P[k, side] = P
+    trail_chain[k + 1] = np.eye(P.shape[0])
+    trail_count[0] = k + 1
+
+
+for _helper in (_congruence, _determinant, _innovation_covariance, _inverse, _joseph, _open, _reset_attitude):
     register_jitable(_helper)
+register_jitable(_transited)
 register_jitable(_propagate_covariance)
 register_jitable(_propagate)
 register_jitable(_fuse)
@@ -369,9 +398,13 @@ def _advance(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, heave: Array, p: Array,
     offsets: Offsets, span: Int, ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array,
     out_sigma: Array, out_covariance: Array, out_deck: Array, out_deck_covariance: Array, count: int,
-    emit_after_ns: int, period_ns: int,
+    emit_after_ns: int, period_ns: int, trail_count: Int, trail_t: Int, trail_marks: Int, trail_x: Array,
+    trail_P: Array, trail_chain: Array, trail_heave: Array,
 ) -> int:  # fmt: skip
     n = P.shape[0]
+    recording = len(trail_t) > 0
+    chain = np.empty((0, 0))
+    x_before, P_before = np.empty(0), np.empty((0, 0))
     F = np.empty((n, n))
     Q = np.empty((n, n))
     H = np.zeros((3, n))
@@ -384,7 +417,11 @@ def _advance(
                 following += 1
         t, t_imu = ints[i, T_NS], ints[following, T_NS]
         imu = floats[following, VALUE:OWN]
-        state = _propagate(clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, heave, span)
+        if recording:
+            chain = trail_chain[trail_count[0]]
+        state = _propagate(
+            clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, heave, span, chain
+        )
         if ints[i, KIND] == HEAVE_MODEL:
             heave[0] = floats[i, OWN]
             heave[1:] = floats[i, VALUE:OWN]
@@ -393,10 +430,24 @@ def _advance(
         if i < following:
             gyro = interpolate(imu0, clock[1], imu, t_imu, t)[:3]
             t_s = (t - clock[2]) * 1e-9
+            if recording:
+                x_before, P_before = state, P.copy()
             ints[i, OUTCOME], ints[i, RESET], state = _fuse(
                 state, P, memory[ints[i, SENSOR]], scatter, ints[i, KIND], floats[i, VALUE:OWN],
                 floats[i, OWN:RESULT], gyro, t_s, ints[i, LATE], p, offsets, H, floats[i, RESULT:],
             )  # fmt: skip
+            if recording and ints[i, OUTCOME] <= _DOWNWEIGHTED:
+                if ints[i, RESET]:
+                    _open(t, state, P, heave, trail_count, trail_t, trail_marks, trail_x, trail_P, trail_chain,
+                          trail_heave)  # fmt: skip
+                    trail_marks[trail_count[0] - 1, RESET_KIND] = ints[i, KIND]
+                    trail_marks[trail_count[0] - 1, RESET_SIZE] = int(floats[i, RESULT + 1])
+                    continue
+                if trail_t[trail_count[0] - 1] != t:
+                    _open(t, x_before, P_before, heave, trail_count, trail_t, trail_marks, trail_x, trail_P,
+                          trail_chain, trail_heave)  # fmt: skip
+                trail_x[trail_count[0] - 1, AFTER] = state
+                trail_P[trail_count[0] - 1, AFTER] = P
             continue
         scatter_update(scatter, imu0, imu, (t - clock[1]) * 1e-9)
         new_period = period_ns == 0 or t // period_ns != clock[1] // period_ns
@@ -413,12 +464,17 @@ def _advance(
                 out_deck[count] = y
                 _congruence(A, P, out_deck_covariance[count])
             count += 1
+            if recording:
+                if trail_t[trail_count[0] - 1] != t:
+                    _open(t, state, P, heave, trail_count, trail_t, trail_marks, trail_x, trail_P, trail_chain,
+                          trail_heave)  # fmt: skip
+                trail_marks[trail_count[0] - 1, EMITS] = 1
         following = i + 1
     x[:] = state
     return count
 
 
-_SOURCES = (deck, frames, models, parameters, rows_module, state, update)
+_SOURCES = (deck, frames, models, parameters, rows_module, state, trail_module, update)
 _kernel = jitted(_advance, [Path(inspect.getfile(m)) for m in _SOURCES] + [Path(__file__)])
 
 
@@ -430,11 +486,12 @@ class CompiledEngine:
     layout: Layout
     state: FilterState
     span: Int
+    trail: Trail
 
     @classmethod
     def start(cls, p: Array, layout: Layout, state: FilterState) -> CompiledEngine:
         """Return an engine at a state."""
-        return cls(p, layout, state, _spans(layout))
+        return cls(p, layout, state, _spans(layout), Trail.off(layout))
 
     def save(self) -> FilterState:
         """Return a checkpoint."""
@@ -448,9 +505,10 @@ class CompiledEngine:
         self, rows: Rows, start: int, stop: int, out: Estimates, emit_after_ns: int, period_ns: int
     ) -> None:
         """Process the rows start..stop in order; see ``FilterPyEngine.advance``."""
-        s = self.state
+        s, trail = self.state, self.trail
         out.count = _kernel(
             s.clock, s.x, s.P, s.imu, s.scatter, s.memory, s.heave, self.p, self.layout.offsets, self.span,
             rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.deck,
-            out.deck_covariance, out.count, emit_after_ns, period_ns,
+            out.deck_covariance, out.count, emit_after_ns, period_ns, trail.count, trail.t_ns, trail.marks,
+            trail.nominal, trail.covariance, trail.chain, trail.heave,
         )  # fmt: skip

@@ -6,7 +6,7 @@ file, socket or thread is touched: time is what the events say.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -36,11 +36,12 @@ from estimation.history import Engine, History
 from estimation.learning import HeaveLearner
 from estimation.ledger import Ledger
 from estimation.outcome import Outcome
-from estimation.output import Facts, Output, Run, estimate_at, with_facts
+from estimation.output import Facts, Output, Run, columns_of, estimate_at, with_facts
 from estimation.parameters import Site, pack_parameters
 from estimation.rows import HEAVE_MODEL, PENDING, Estimates, FilterState, Int, Rows
 from estimation.screening import malformed
-from estimation.state import BA0, BG0, P0, PH0, PLATFORM_HEAVE, PS0, Q0, V0, Layout
+from estimation.state import BG0, PH0, PLATFORM_HEAVE, PS0, Layout
+from estimation.tape import Tape
 
 EngineName = Literal["auto", "filterpy", "compiled"]
 
@@ -62,12 +63,14 @@ class LandingEstimator:
     """State estimation of the vehicle (and, as it is switched on, of the platform) from events.
 
     ``engine`` is ``"compiled"`` (needs numba), ``"filterpy"`` (the reference, and the one for sensors added with
-    ``add_sensor``) or ``"auto"``. ``facts`` are used where the configuration leaves a value open.
+    ``add_sensor``) or ``"auto"``. ``facts`` are used where the configuration leaves a value open. With ``smooth`` the
+    events are kept, so that ``smoothed`` can go back over them.
     """
 
     config: Config = field(default_factory=Config)
     engine: EngineName = "auto"
     facts: Facts = field(default_factory=Facts)
+    smooth: bool = False
     layout: Layout = field(init=False)
     engine_name: str = field(init=False)
     _names: Names = field(default_factory=Names)
@@ -93,7 +96,7 @@ class LandingEstimator:
         c = self.config = with_facts(self.config, self.facts)
         self.layout = Layout.of(c)
         self.engine_name = _choose(self.engine)
-        self._history = History(int(c.filter.window_s * 1e9))
+        self._history = History(int(c.filter.window_s * 1e9), tape=Tape() if self.smooth else None)
         self._clocks = ClockBank(AUTOPILOT)
         self._period_ns = round(1e9 / c.filter.output_rate_hz) if c.filter.output_rate_hz else 0
         self._latency = np.round(latencies_s(c, self.facts) * 1e9)
@@ -199,6 +202,21 @@ class LandingEstimator:
         rest.outcome[:] = Outcome.REJECTED_FUTURE
         self._ledger.keep(rest)
         h.drop(h.size)
+
+    def smoothed(self, run: Run) -> Run:
+        """Return a finished run with its estimates replaced by smoothed ones, from what came before and after each.
+
+        They begin where the filter does, up to a window before its first estimate came out. Raises ``ValueError``
+        where the estimator was not told to ``smooth``.
+        """
+        if self._history.tape is None:
+            raise ValueError("nothing was kept to be smoothed; make the estimator with smooth=True")
+        if self._site is None:
+            return run
+        from estimation.smoother import smooth
+
+        p = pack_parameters(self.config, self._site)
+        return replace(run, **columns_of(smooth(self._history.tape, self.layout, p, self._period_ns)))
 
     # -- intake ------------------------------------------------------------------------------------------------
 
@@ -406,12 +424,9 @@ class LandingEstimator:
         """Settle all, and align anew with what is known of the site and the gyro."""
         h = self._history
         t = h.newest_ns or 0
-        bias = None
-        if self._engine is not None:
-            self._ledger.keep(h.settle(everything=True))
-            bias = self._engine.state.x[BG0 : BG0 + 3].copy()
+        self.finish()
+        bias = None if self._engine is None else self._engine.state.x[BG0 : BG0 + 3].copy()
         self._ledger.note(t, f"{why}: aligning again")
-        h.drop(h.size)
         h.checkpoints.clear()
         self._engine = None
         self._consumed = 0
@@ -454,23 +469,12 @@ class LandingEstimator:
         return estimates, records, notes
 
     def _as_run(self, e: Estimates, records: NDArray[np.void], notes: list[tuple[int, str]]) -> Run:
-        x = e.x
         records = records[np.lexsort((records["sensor"], records["t_ns"]))]
         return Run(
+            **columns_of(e),
             engine=self.engine_name,
-            t_ns=e.t_ns,
-            position_m=x[:, P0 : P0 + 3],
-            velocity_mps=x[:, V0 : V0 + 3],
-            quaternion=x[:, Q0 : Q0 + 4],
-            covariance=e.covariance,
-            gyro_bias=x[:, BG0 : BG0 + 3],
-            accel_bias=x[:, BA0 : BA0 + 3],
-            nominal=x,
-            sigma=e.sigma,
             state_names=self.layout.names,
             state_units=self.layout.units,
-            deck=e.deck,
-            deck_covariance=e.deck_covariance,
             heave=list(self._heave),
             clocks=self._clocks.summary(int(e.t_ns[-1]) if len(e.t_ns) else 0),
             records=records,

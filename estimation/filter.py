@@ -20,6 +20,7 @@ from estimation.frames import Array
 from estimation.outcome import Outcome
 from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
 from estimation.state import ATTITUDE, Layout, plus
+from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
 
 if TYPE_CHECKING:
     from filterpy.kalman import ExtendedKalmanFilter
@@ -35,7 +36,8 @@ Model = Callable[[Array, Array, Layout], tuple[Array, Array, Array]]
 class FilterPyEngine:
     """Processes rows in order with filterpy's EKF.
 
-    ``p`` is the parameter vector, ``users`` maps a sensor's index to the user's model.
+    ``p`` is the parameter vector, ``users`` maps a sensor's index to the user's model; what happens is written to
+    ``trail`` where it is on.
     """
 
     p: Array
@@ -43,13 +45,14 @@ class FilterPyEngine:
     state: FilterState
     users: Mapping[int, Model]
     ekf: ExtendedKalmanFilter
+    trail: Trail
 
     @classmethod
     def start(
         cls, p: Array, layout: Layout, state: FilterState, users: Mapping[int, Model] | None = None
     ) -> FilterPyEngine:
         """Return an engine at a state; imports filterpy."""
-        return cls(p, layout, state, users or {}, _ekf(layout.size))
+        return cls(p, layout, state, users or {}, _ekf(layout.size), Trail.off(layout))
 
     def save(self) -> FilterState:
         """Return a checkpoint."""
@@ -83,7 +86,10 @@ class FilterPyEngine:
                 continue
             if i < following:
                 gyro = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, t)[:3]
+                x, P = s.x, s.P
                 self._fuse(rows, i, gyro)
+                if self.trail.on:
+                    self._record(rows, i, x, P)
                 continue
             update.scatter_update(s.scatter, s.imu, imu, (t - int(s.clock[1])) * 1e-9)
             new_period = period_ns == 0 or t // period_ns != int(s.clock[1]) // period_ns
@@ -91,6 +97,9 @@ class FilterPyEngine:
             s.imu = imu.copy()
             if t > emit_after_ns and new_period:
                 self._write(out, t)
+                if self.trail.on:
+                    self.trail.reach(t, s.x, s.P, s.heave)
+                    self.trail.marks[self.trail.count[0] - 1, EMITS] = 1
             following = i + 1
 
     def _propagate(self, t: int, t_imu: int, imu: Array) -> None:
@@ -115,6 +124,9 @@ class FilterPyEngine:
             self.ekf.Q = Q
             self.ekf.predict()
             s.P = 0.5 * (self.ekf.P + self.ekf.P.T)
+            if self.trail.on:
+                k = self.trail.count[0]
+                self.trail.chain[k] = F @ self.trail.chain[k]
         s.clock[0] = t
 
     def _fuse(self, rows: Rows, i: int, gyro: Array) -> None:
@@ -181,6 +193,19 @@ class FilterPyEngine:
         if stop:
             update.hold_latency(s.x, self.p)
         s.P = 0.5 * (P + P.T)
+
+    def _record(self, rows: Rows, i: int, x: Array, P: Array) -> None:
+        """Note a measurement that was fused, with the state before it."""
+        s, trail = self.state, self.trail
+        if rows.outcome[i] > Outcome.DOWNWEIGHTED:
+            return
+        if rows.reset[i]:
+            trail.open(int(rows.t_ns[i]), s.x, s.P, s.heave)
+            trail.marks[trail.count[0] - 1, RESET_KIND] = rows.kind[i]
+            trail.marks[trail.count[0] - 1, RESET_SIZE] = int(rows.result[i, 1])
+            return
+        trail.reach(int(rows.t_ns[i]), x, P, s.heave)
+        trail.close(s.x, s.P)
 
     def _write(self, out: Estimates, t: int) -> None:
         s, k = self.state, out.count

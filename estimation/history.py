@@ -14,6 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from estimation.rows import Estimates, FilterState, Int, Rows
+from estimation.tape import Tape
+from estimation.trail import Trail
 
 IMU = 0
 CHECKPOINT_NS = 70_000_000
@@ -24,6 +26,7 @@ class Engine(Protocol):
     """What the history asks of an engine; ``estimation.filter`` and ``estimation.compiled`` have it."""
 
     state: FilterState
+    trail: Trail
 
     def save(self) -> FilterState:
         """Return a checkpoint."""
@@ -43,7 +46,8 @@ class History:
 
     ``done`` rows are behind the engine; ``stale`` is set while the engine is past an insertion and must go back.
     ``newest_ns`` is the time of the newest inertial sample that arrived. ``checkpoints`` pair a row's index, all
-    rows up to and including which are in the saved state, with that state.
+    rows up to and including which are in the saved state, with that state. ``tape`` takes what nothing can change any
+    more, for a smoother.
     """
 
     window_ns: int
@@ -54,6 +58,7 @@ class History:
     newest_ns: int | None = None
     emitted_ns: int = 0
     checkpoints: list[tuple[int, FilterState]] = field(default_factory=list)
+    tape: Tape | None = None
 
     def insert(self, new: Rows) -> Int:
         """Put events where they belong; return the ids of exact repetitions, which are left out."""
@@ -93,6 +98,8 @@ class History:
         self.checkpoints = [(at - 1, engine.save())]
         self.done = at
         self.stale = False
+        if self.tape is not None:
+            self.tape.begin(engine)
 
     def advance(self, engine: Engine, out: Estimates, period_ns: int) -> None:
         """Run the engine to the newest inertial sample, rewinding first where something was inserted."""
@@ -140,6 +147,8 @@ class History:
         if cut <= 0:
             return Rows.empty(0)
         settled = self.rows.take(np.arange(cut))
+        if self.tape is not None:
+            self.tape.keep(settled, None if everything else self.checkpoints[0][1])
         self.drop(cut)
         return settled
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -14,7 +15,7 @@ from estimation.frames import Array
 from estimation.heave.model import HeaveModel
 from estimation.outcome import Outcome
 from estimation.rows import Estimates, Int
-from estimation.state import P0, Q0, V0
+from estimation.state import BA0, BG0, P0, Q0, V0
 
 RECORD_DTYPE = np.dtype(
     [
@@ -142,3 +143,21 @@ def estimate_at(e: Estimates, i: int) -> Estimate:
         e.deck[i],
         e.deck_covariance[i],
     )
+
+
+def columns_of(e: Estimates) -> dict[str, Any]:
+    """Return the columns of a ``Run`` that are estimates."""
+    x = e.x
+    return {
+        "t_ns": e.t_ns,
+        "position_m": x[:, P0 : P0 + 3],
+        "velocity_mps": x[:, V0 : V0 + 3],
+        "quaternion": x[:, Q0 : Q0 + 4],
+        "covariance": e.covariance,
+        "gyro_bias": x[:, BG0 : BG0 + 3],
+        "accel_bias": x[:, BA0 : BA0 + 3],
+        "nominal": x,
+        "sigma": e.sigma,
+        "deck": e.deck,
+        "deck_covariance": e.deck_covariance,
+    }

@@ -209,3 +209,24 @@ def reset_datum(kind: int, x: Array, P: Array, r: Array, R: Array, dimension: in
                 P[block + i, block + j] = P[other + i, other + j]
     for i in range(dimension):
         P[block + i, block + i] += R[i, i]
+
+
+def reset_transition(kind: int, dimension: int, offsets: Offsets, n: int) -> Array:
+    """Return T (n, n) of ``reset_datum`` seen as a transition of the error state: it leaves T P T' and new noise.
+
+    What it cuts has no column in T: nothing that is learned after the reset tells of it before.
+    """
+    T = np.eye(n)
+    if kind == VISION:
+        return T
+    if kind == GPS_POSITION:
+        block, other, sign = offsets[POSITION], offsets[GPS_BIAS], -1.0
+    elif kind == GPS_VELOCITY:
+        block, other, sign = offsets[VELOCITY], -1, 0.0
+    else:
+        block, other, sign = offsets[BARO_BIAS], offsets[POSITION] + 2, 1.0
+    for i in range(dimension):
+        T[block + i, block + i] = 0.0
+        if other >= 0:
+            T[block + i, other + i] = sign
+    return T
