@@ -19,6 +19,7 @@ import click
 from deckfix._version import __version__
 from deckfix.cli_detect import detect
 from deckfix.cli_heave import heave
+from deckfix.cli_onboard import onboard
 from deckfix.cli_sync import sync
 from deckfix.cli_vision import calibrate, target
 
@@ -255,6 +256,7 @@ def demo(output: str, seed: int, force: bool) -> None:
 
 
 deckfix.add_command(detect)
+deckfix.add_command(onboard)
 deckfix.add_command(target)
 deckfix.add_command(calibrate)
 deckfix.add_command(heave)

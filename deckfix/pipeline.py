@@ -153,6 +153,10 @@ class Pipeline:
         """Take events in the order of arrival and return every step."""
         return [self.step(event) for event in events]
 
+    def finish(self) -> Step:
+        """Settle what is still in the estimator's window: the records that a replay's end has, too."""
+        return Step(None, self.estimator.settled())
+
     def expected(self, time_ns: int | None) -> Fix | Array | None:
         """Return where the target should be in the camera at an inertial time: P^c [m], or a fix moved there.
 

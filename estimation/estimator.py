@@ -218,6 +218,11 @@ class LandingEstimator:
         p = pack_parameters(self.config, self._site)
         return replace(run, **columns_of(smooth(self._history.tape, self.layout, p, self._period_ns)))
 
+    def settled(self) -> Output:
+        """Settle what is still in the window, as ``finish`` does, and return what came of it."""
+        self.finish()
+        return self._output()
+
     # -- intake ------------------------------------------------------------------------------------------------
 
     def _named(self, batch: EventBatch) -> NDArray[np.void]:

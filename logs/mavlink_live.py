@@ -135,6 +135,11 @@ class SensorStream:
     _attitude: str = ""
     _pressure: str = ""
 
+    @property
+    def counts_turned_away(self) -> dict[str, int]:
+        """Messages turned away, by reason."""
+        return {reason: n for reason, n in self.counts.items() if reason not in _USED}
+
     def take(self, name: str, row: Rows, arrival_ns: int) -> list[Event]:
         """Return the events of one message (a row of ``logs.tlog.dialect``); none for what is no sensor's."""
         if name not in _USED:

@@ -37,7 +37,7 @@ def test_options_shown_exist() -> None:
     known = {o for c in program.commands.values() for p in c.params for o in p.opts}
     known |= {"--help", "--version"}
     for line in re.findall(r"^ {4}.*deckfix [a-z]+ .*$", text, re.M):
-        for option in re.findall(r"--[a-z]+", line.split("#")[0]):
+        for option in re.findall(r"--[a-z-]+", line.split("#")[0]):
             assert option in known, line
 
 

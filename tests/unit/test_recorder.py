@@ -1,0 +1,120 @@
+"""The recorder and the queues: a slow or full disk costs data, which is counted, and never an estimate."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_flight import small_events
+
+from deckfix import recorder as module
+from deckfix.files import OutputError
+from deckfix.intake import MOST_EVENTS, CompanionClock, Intake
+from deckfix.pipeline import ImageEvent, Pipeline
+from deckfix.recorder import Recorder, log_path
+from estimation.events import COMPANION, Imu
+from logs import open_flight
+from logs.errors import LogError
+from logs.writer import FlightWriter
+
+UTC_NS = 1_795_000_000_000_000_000
+
+
+def image(arrival_ns: int, side: int = 64) -> ImageEvent:
+    return ImageEvent(arrival_ns, arrival_ns, np.zeros((side, side, 3), np.uint8), clock=COMPANION)
+
+
+def begun(path: Path) -> tuple[Recorder, Pipeline]:
+    pipeline = Pipeline(engine="filterpy")
+    made = Recorder(path, pipeline.estimator, {})
+    made.begin()
+    return made, pipeline
+
+
+def test_a_folder_gets_a_file_named_by_the_time_and_nothing_is_overwritten(tmp_path: Path) -> None:
+    made = log_path(tmp_path / "flights", UTC_NS)
+    assert made == tmp_path / "flights" / "20261118-110640.mcap"
+    made.write_bytes(b"a flight")
+    with pytest.raises(OutputError, match="exists already"):
+        log_path(tmp_path / "flights", UTC_NS)
+    with pytest.raises(OutputError, match="is a file"):
+        log_path(_file(tmp_path), UTC_NS)
+
+
+def _file(folder: Path) -> Path:
+    path = folder / "file"
+    path.write_text("x")
+    return path
+
+
+def test_a_slow_disk_delays_nobody_and_costs_images_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = FlightWriter.write_series
+
+    def slow(self: FlightWriter, *series: object) -> None:
+        time.sleep(0.5)
+        write(self, *series)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(FlightWriter, "write_series", slow)
+    monkeypatch.setattr(module, "MOST_IMAGE_BYTES", 100_000)
+    monkeypatch.setattr(module, "PERIOD_S", 0.02)
+    made, pipeline = begun(tmp_path / "f.mcap")
+    begin = time.monotonic()
+    events = small_events(1.0)
+    for k, event in enumerate(events):
+        made.step(pipeline.step(event))
+        if k % 5 == 0:
+            made.image(image(event.arrival_ns))
+    assert time.monotonic() - begin < 5.0
+    assert made.drops["images"] > 0
+    assert made.drops["steps"] == 0
+    made.close()
+    assert made.failed == ""
+    log = open_flight(tmp_path / "f.mcap")
+    assert len(log.events()) == len(events)
+
+
+def test_a_full_disk_is_said_and_the_flight_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, pipeline = begun(tmp_path / "f.mcap")
+
+    def full(self: FlightWriter, *series: object) -> None:
+        raise LogError(self.path, "cannot be written (No space left on device)", "free space")
+
+    monkeypatch.setattr(FlightWriter, "write_series", full)
+    monkeypatch.setattr(module, "PERIOD_S", 0.02)
+    events = small_events(1.0)
+    made.step(pipeline.step(events[0]))
+    until = time.monotonic() + 5.0
+    while not made.failed and time.monotonic() < until:
+        time.sleep(0.01)
+    made.step(pipeline.step(events[1]))
+    assert "No space left" in made.failed
+    assert made.drops["steps"] == 1
+    made.close()
+
+
+def test_the_queue_gives_what_came_in_the_order_of_arrivals_all_different() -> None:
+    intake = Intake(lambda: UTC_NS)  # a clock that stands still
+    intake.put([Imu(k, 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) for k in range(5)])
+    intake.put_image(image(0))
+    taken = [intake.get(0.0) for _ in range(6)]
+    arrivals = [t.arrival_ns for t in taken if t is not None]
+    assert arrivals == sorted(set(arrivals))
+    assert len(arrivals) == 6
+    assert intake.get(0.0) is None
+
+
+def test_the_queue_is_bounded_and_keeps_the_newest_image() -> None:
+    intake = Intake(CompanionClock())
+    for k in range(3):
+        intake.put_image(image(k, side=8 + k))
+    intake.put([Imu(k, 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) for k in range(MOST_EVENTS + 10)])
+    assert intake.drops["images"] == 2
+    assert intake.drops["events"] == 11
+    first = intake.get(0.0)
+    assert isinstance(first, ImageEvent)
+    assert isinstance(first.image, np.ndarray)
+    assert first.image.shape[0] == 10
