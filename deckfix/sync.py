@@ -43,6 +43,9 @@ FINEST_S = 2e-4
 """Least spacing of the last grid: below it the rounding of the replays would show."""
 KNOWN_S = 0.005
 """A latency with a larger sigma than this counts as unobservable."""
+UNKNOWN_S = MAX_LATENCY_S / math.sqrt(12.0)
+"""Sigma of a latency of which nothing is known but that it lies between 0 and ``MAX_LATENCY_S`` [s]."""
+HARDLY_TURNED = "the vehicle turned too little while it saw the target"
 PARTS = 20
 """Disjoint parts of the flight whose slopes are compared."""
 LEAST_FIXES = 60
@@ -134,8 +137,14 @@ def latency_profile(
             "holds no vision fixes; import the file that has them, or run deckfix replay on its images"
         )
     mapped, clocks = on_inertial_clock(batch, by_arrival)
-    found = profile_of(_Replay(mapped, config, facts or Facts(), engine), jobs)
-    return replace(found, rotation_radps=_rotation(mapped), by_arrival=by_arrival, clocks=clocks)
+    # The replays hold the latency themselves: no prior of the log's own may come in between.
+    known = replace(facts or Facts(), vision_by_arrival=False)
+    found = profile_of(_Replay(mapped, config, known, engine), jobs)
+    found = replace(found, rotation_radps=_rotation(mapped), by_arrival=by_arrival, clocks=clocks)
+    if found.rotation_radps >= config.vision.latency_rate_radps:
+        return found
+    # What is left then is how the vehicle moves against the raft, and that tells of the raft's sway as well.
+    return replace(found, status=LatencyStatus.UNOBSERVABLE, reason=HARDLY_TURNED, sigma_s=UNKNOWN_S)
 
 
 def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:
@@ -166,7 +175,7 @@ def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:
     total = values.sum(axis=1)
     return LatencyProfile(
         latency_s=max(peak, 0.0) if status is LatencyStatus.ESTIMATED else peak,
-        sigma_s=min(sigma, MAX_LATENCY_S / math.sqrt(12.0)),
+        sigma_s=min(sigma, UNKNOWN_S),
         status=status,
         reason=reason,
         grid_s=grid,
@@ -330,7 +339,7 @@ def _judged(
         first, second = (f"{v * 1e3:.1f} ± {s * 1e3:.1f} ms" for v, s in halves)
         return inconsistent, f"the halves of the flight disagree: {first} and {second}"
     if not sigma <= KNOWN_S:
-        return unobservable, "the vehicle turned too little while it saw the target"
+        return unobservable, HARDLY_TURNED
     if not LOWEST_S < peak < MAX_LATENCY_S:
         span = f"{LOWEST_S * 1e3:.0f} to {MAX_LATENCY_S * 1e3:.0f} ms"
         return inconsistent, f"the likelihood still rises at the end of what is searched, {span}"

@@ -38,8 +38,20 @@ from estimation.ledger import Ledger
 from estimation.outcome import Outcome
 from estimation.output import Facts, Output, Run, columns_of, estimate_at, with_facts
 from estimation.parameters import Site, pack_parameters
-from estimation.rows import HEAVE_MODEL, PENDING, Estimates, FilterState, Int, Rows
-from estimation.screening import malformed
+from estimation.rows import (
+    AGE_NS,
+    HEAVE_MODEL,
+    LATE,
+    OWN,
+    PENDING,
+    RESULT,
+    VALUE,
+    Estimates,
+    FilterState,
+    Int,
+    Rows,
+)
+from estimation.screening import malformed, malformed_one
 from estimation.state import BG0, PH0, PLATFORM_HEAVE, PS0, Layout
 from estimation.tape import Tape
 
@@ -152,7 +164,10 @@ class LandingEstimator:
 
     def step(self, event: Event) -> Output:
         """Take one event, in the order of arrival."""
-        self._take(np.array([pack(event, self._names)], dtype=EVENT_DTYPE))
+        if self._engine is None:
+            self._take(np.array([pack(event, self._names)], dtype=EVENT_DTYPE))
+        else:
+            self._take_one(event)
         return self._output()
 
     def feed(self, batch: EventBatch) -> Output:
@@ -251,6 +266,46 @@ class LandingEstimator:
         bad = r.outcome != PENDING
         self._ledger.reject(r.take(np.flatnonzero(bad)))
         self._feed(r.take(np.flatnonzero(~bad)))
+
+    def _take_one(self, event: Event) -> None:
+        """Take one event while the filter runs: what ``_take`` does, without columns of one entry."""
+        if isinstance(event, TimeSync):
+            self._next_id += 1
+            self._clocks.exchange(event)
+            return
+        stamp, arrival, kind, sensor, _, value, own = pack(event, self._names)
+        number, t, known = self._next_id, stamp, True
+        self._next_id += 1
+        if event.clock != AUTOPILOT or kind == Kind.GPS_POSITION:
+            self._clocks.observe(event.clock, stamp, arrival)
+            reading = self._clocks.convert(event.clock, stamp)
+            known = reading is not None
+            t = stamp if reading is None else reading.time_ns
+        model = self._models.get(event.sensor)
+        t -= int(self._latency[kind]) if model is None else round(model[1] * 1e9)
+        outcome = malformed_one(kind, value, own) if known else int(Outcome.REJECTED_NOT_READY)
+        row = Rows.empty(1)
+        row.ints[0] = (t, kind, sensor, number, 0, stamp, arrival, 0, outcome, 0)
+        row.floats[0, VALUE:OWN], row.floats[0, OWN:RESULT] = value, own
+        if outcome != PENDING:
+            self._ledger.reject(row)
+            return
+        h, imu = self._history, kind == Kind.IMU
+        newest = h.newest_ns
+        assert newest is not None
+        far = max(h.window_ns, int(self.config.imu.gap_s * 1e9)) if imu else h.window_ns
+        if not newest - h.window_ns <= t <= newest + far:
+            self._feed(row)
+            return
+        late = t < newest or (imu and t == newest)
+        row.ints[0, LATE], row.ints[0, AGE_NS] = late, newest - t
+        if imu:
+            h.newest_ns = max(newest, t)
+            self._past.clear()
+        if len(h.insert(row)):
+            self._ledger.reject(row, Outcome.REJECTED_DUPLICATE)
+        if not late:
+            self._advance()
 
     def _content_times(
         self, rows: NDArray[np.void], timesync_reference: str
@@ -462,9 +517,11 @@ class LandingEstimator:
         self._history.drop(count)
 
     def _output(self) -> Output:
-        estimates, records, notes = self._collect()
-        last = estimates.count - 1
-        return Output(estimate_at(estimates, last) if last >= 0 else None, records, notes)
+        estimate = (
+            estimate_at(self._estimates[-1], self._estimates[-1].count - 1) if self._estimates else None
+        )
+        self._estimates.clear()
+        return Output(estimate, self._ledger.take_records(self._names), self._ledger.take_notes())
 
     def _collect(self) -> tuple[Estimates, NDArray[np.void], list[tuple[int, str]]]:
         estimates = Estimates.concatenate(self._estimates, self.layout)

@@ -18,7 +18,7 @@ from estimation.tape import Tape
 from estimation.trail import Trail
 
 IMU = 0
-CHECKPOINT_NS = 70_000_000
+CHECKPOINT_NS = 20_000_000
 """Spacing of the checkpoints: what a rewind runs again beyond the event's own age, at most."""
 
 
@@ -67,6 +67,11 @@ class History:
             return np.empty(0, dtype=np.int64)
         place = self.size
         first = int(new.t_ns.min())
+        if n == 1 and (place == 0 or self.rows.t_ns[place - 1] < first):
+            self._reserve(place + 1)
+            self.rows.write(place, new)
+            self.size = place + 1
+            return np.empty(0, dtype=np.int64)
         if place and self.rows.t_ns[place - 1] >= first:
             place = int(np.searchsorted(self.rows.t_ns[:place], first, side="left"))
         merged = Rows.concatenate(self.rows.take(slice(place, self.size)), new) if place < self.size else new
@@ -112,22 +117,23 @@ class History:
             engine.load(self.checkpoints[-1][1])
             self.stale = False
         t = self.rows.t_ns
-        is_imu = self.rows.kind[self.done : stop] == IMU
-        imu_at = self.done + np.flatnonzero(is_imu)
-        grid = t[imu_at] // CHECKPOINT_NS
-        last = self.checkpoints[-1][1].clock[0] // CHECKPOINT_NS
-        fresh = np.empty(len(grid), dtype=bool)
-        fresh[0] = grid[0] != last
-        fresh[1:] = grid[1:] != grid[:-1]
-        fresh &= t[imu_at] >= t[stop - 1] - self.window_ns - 2 * CHECKPOINT_NS
-        for index in imu_at[fresh]:
-            engine.advance(self.rows, self.done, int(index) + 1, out, self.emitted_ns, period_ns)
-            self.done = int(index) + 1
-            self.checkpoints.append((int(index), engine.save()))
+        begin, newest = self.done, int(t[stop - 1])
+        oldest = newest - self.window_ns - 2 * CHECKPOINT_NS
+        last = int(self.checkpoints[-1][1].clock[0]) // CHECKPOINT_NS
+        todo = zip(t[begin:stop].tolist(), self.rows.kind[begin:stop].tolist(), strict=True)
+        for index, (time, kind) in enumerate(todo, begin):
+            if kind != IMU:
+                continue
+            before, last = last, time // CHECKPOINT_NS
+            if last == before or time < oldest:
+                continue
+            engine.advance(self.rows, self.done, index + 1, out, self.emitted_ns, period_ns)
+            self.done = index + 1
+            self.checkpoints.append((index, engine.save()))
         if self.done < stop:
             engine.advance(self.rows, self.done, stop, out, self.emitted_ns, period_ns)
             self.done = stop
-        self.emitted_ns = max(self.emitted_ns, int(t[stop - 1]))
+        self.emitted_ns = max(self.emitted_ns, newest)
 
     def settle(self, everything: bool = False) -> Rows:
         """Forget and return the rows that nothing can change any more (all that are done, for ``everything``)."""
