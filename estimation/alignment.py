@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation.config import Config
-from estimation.deck import heave_stationary
+from estimation.deck import MOTION_SIZE, SWAY_OMEGA, heave_stationary, prior_motion
 from estimation.events import Kind
 from estimation.frames import (
     Array,
@@ -456,7 +456,7 @@ class Aligner:
                 P[k, k] = P[d, d] + c.barometer.sigma_m**2
             else:
                 P[k, k] = 100.0**2
-        heave = np.zeros(7)
+        heave = np.zeros(MOTION_SIZE)
         if o[PLATFORM_OFFSET] >= 0:
             heave = self._put_platform(P)
         memory = np.zeros((self.sensors, MEMORY_SIZE))
@@ -464,7 +464,7 @@ class Aligner:
         return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(3), memory, heave)
 
     def _put_platform(self, P: Array) -> Array:
-        """Write what is known of the platform before it is seen into P; return its heave parameters."""
+        """Write what is known of the platform before it is seen into P; return the parameters of its motion."""
         d, v, o = self.config.platform, self.config.vision, self.layout.offsets
 
         def put(block: int, covariance: Array) -> None:
@@ -474,13 +474,10 @@ class Aligner:
         radius = UNKNOWN_PLACE_M if d.anchor_radius_m is None else d.anchor_radius_m
         put(PLATFORM_OFFSET, np.eye(2) * radius**2)
         put(PLATFORM_LEVEL, np.eye(1) * UNKNOWN_LEVEL_M**2)
-        omega = 2.0 * math.pi / d.sway_period_s
-        sway = d.sway_sigma_m**2 * np.array([1.0, omega**2])
+        heave = prior_motion(d)
+        sway = d.sway_sigma_m**2 * np.array([1.0, heave[SWAY_OMEGA] ** 2])
         put(PLATFORM_SWAY, np.diag(np.tile(sway, 2)))
-        heave = np.array([1.0, *[2.0 * math.pi / d.heave_period_s] * 3, *[d.heave_damping] * 3])
-        stationary = heave_stationary(heave)
-        heave[0] = d.heave_sigma_m / math.sqrt(stationary[5, 5])
-        put(PLATFORM_HEAVE, heave[0] ** 2 * stationary)
+        put(PLATFORM_HEAVE, heave_stationary(heave))
         put(RANGE_SCALE, np.eye(1) * v.scale_sigma**2)
         put(CAMERA_LATENCY, np.eye(1) * v.latency_sigma_s**2)
         put(CAMERA_MOUNT, np.eye(3) * v.mount_sigma_rad**2)

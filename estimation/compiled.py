@@ -19,7 +19,7 @@ from estimation import deck, frames, models, parameters, state, update
 from estimation import rows as rows_module
 from estimation import trail as trail_module
 from estimation.codecache import jitted
-from estimation.deck import deck_output, seen_height
+from estimation.deck import HEAVE_PARAMETERS, MOTION_SIZE, add_drift, change_motion, deck_output, seen_place
 from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
 from estimation.outcome import Outcome
@@ -39,7 +39,7 @@ from estimation.rows import (
     Int,
     Rows,
 )
-from estimation.state import ATTITUDE, PLATFORM_HEAVE, PLATFORM_SWAY, SIZES, Layout, Offsets, plus
+from estimation.state import ATTITUDE, PL0, PLATFORM_HEAVE, PLATFORM_SWAY, SIZES, Layout, Offsets, plus
 from estimation.trail import AFTER, EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.update import (
     MAX_STEP_S,
@@ -105,7 +105,8 @@ for _module in (deck, frames, models, state, update):
         if (
             inspect.isfunction(_function)
             and _function.__module__ == _module.__name__
-            and _function not in (frames.compose, frames.rotate, models.put, deck.heave_stationary)
+            and _function
+            not in (frames.compose, frames.rotate, models.put, deck.heave_stationary, deck.prior_motion)
         ):
             register_jitable(_function)
 
@@ -221,8 +222,8 @@ def _fuse(
     result[0] = nis
     result[1] = m
     if kind == VISION:
-        result[8], result[9] = seen_height(r, R, x, p)
-    result[10] = math.log(_determinant(S, m))
+        seen_place(r, R, x, p, result[8:14])
+    result[15] = math.log(_determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     if w == 0.0:
@@ -250,6 +251,7 @@ def _fuse(
     att = offsets[ATTITUDE]
     _reset_attitude(P, right_jacobian(error[att : att + 3]), att)
     x = plus(x, error, offsets)
+    result[14] = x[PL0]
     if stop > 0:
         for i in range(first, stop):
             for j in range(first, stop):
@@ -423,8 +425,11 @@ def _advance(
             clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, heave, span, chain
         )
         if ints[i, KIND] == HEAVE_MODEL:
-            heave[0] = floats[i, OWN]
-            heave[1:] = floats[i, VALUE:OWN]
+            motion = np.empty(MOTION_SIZE)
+            motion[0] = floats[i, OWN]
+            motion[1:HEAVE_PARAMETERS] = floats[i, VALUE:OWN]
+            motion[HEAVE_PARAMETERS:] = floats[i, OWN + 1 : OWN + 5]
+            change_motion(state, P, heave, motion, offsets, chain)
             ints[i, OUTCOME] = _FUSED
             continue
         if i < following:
@@ -463,6 +468,7 @@ def _advance(
                 y, A = deck_output(state, heave, offsets, n)
                 out_deck[count] = y
                 _congruence(A, P, out_deck_covariance[count])
+                add_drift(heave, out_deck_covariance[count])
             count += 1
             if recording:
                 if trail_t[trail_count[0] - 1] != t:

@@ -16,7 +16,7 @@ from estimation.ahead import DeckForecast, DeckForecaster
 from estimation.alignment import Aligner
 from estimation.clockbank import ClockBank, ClockSummary
 from estimation.config import Config, ConfigError
-from estimation.deck import HEAVE_SIZE
+from estimation.deck import HEAVE_PARAMETERS, HEAVE_SIZE, SWAY_OMEGA, prior_motion
 from estimation.events import (
     AUTOPILOT,
     COMPANION,
@@ -33,7 +33,7 @@ from estimation.filter import Model
 from estimation.frames import Array
 from estimation.heave.model import HeaveModel
 from estimation.history import Engine, History
-from estimation.learning import HeaveLearner
+from estimation.learning import MotionLearner
 from estimation.ledger import Ledger
 from estimation.outcome import Outcome
 from estimation.output import Facts, Output, Run, columns_of, estimate_at, with_facts
@@ -99,7 +99,7 @@ class LandingEstimator:
     _past: list[tuple[int, int]] = field(default_factory=list)
     _estimates: list[Estimates] = field(default_factory=list)
     _ledger: Ledger = field(default_factory=Ledger)
-    _learner: HeaveLearner | None = None
+    _learner: MotionLearner | None = None
     _heave: list[tuple[int, HeaveModel]] = field(default_factory=list)
     _utc_s: float = 0.0
 
@@ -113,8 +113,8 @@ class LandingEstimator:
         self._period_ns = round(1e9 / c.filter.output_rate_hz) if c.filter.output_rate_hz else 0
         self._latency = np.round(latencies_s(c, self.facts) * 1e9)
         if c.platform.use and c.platform.learn_s > 0.0:
-            self._learner = HeaveLearner(
-                c.platform.learn_s, c.platform.learn_window_s, 0.3 * c.platform.heave_sigma_m
+            self._learner = MotionLearner(
+                c.platform.learn_s, c.platform.learn_window_s, prior_motion(c.platform)
             )
         self._new_aligner()
 
@@ -201,9 +201,9 @@ class LandingEstimator:
         learned = self._learner is not None and self._learner.block is not None
         x = s.x[PH0 : PH0 + HEAVE_SIZE]
         c = self.config.platform
-        swing = np.array([2.0 * np.pi / c.sway_period_s, c.sway_damping])
-        sway = s.x[PS0 : PS0 + 4]
-        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], s.heave, learned, sway, swing)
+        swing = np.array([s.heave[SWAY_OMEGA], c.sway_damping])
+        sway, heave = s.x[PS0 : PS0 + 4], s.heave[:HEAVE_PARAMETERS]
+        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], heave, learned, sway, swing)
 
     def finish(self) -> None:
         """Settle what is still in the window; measurements that no inertial sample followed were in the future."""
@@ -414,17 +414,16 @@ class LandingEstimator:
             self._learn(settled)
 
     def _learn(self, settled: Rows) -> None:
-        """Learn the heave from fixes that are final; the filter takes the result up a fixed time later, so that
-        neither the order of arrival nor the size of a batch shows."""
+        """Learn the platform's motion from fixes that are final; the filter takes the result up a fixed time later, so
+        that neither the order of arrival nor the size of a batch shows."""
         assert self._learner is not None
         for due_ns, model, parameters in self._learner.take(settled):
             self._heave.append((due_ns, model))
-            if parameters is None:
-                continue
             row = Rows.empty(1)
             row.t_ns[0] = due_ns + self._history.window_ns + TAKE_UP_NS
             row.kind[0] = HEAVE_MODEL
-            row.value[0], row.own[0, 0] = parameters[1:], parameters[0]
+            row.own[0, 0], row.value[0] = parameters[0], parameters[1:HEAVE_PARAMETERS]
+            row.own[0, 1:5] = parameters[HEAVE_PARAMETERS:]
             row.id[0] = -1
             self._history.insert(row)
 

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimation import models, update
-from estimation.deck import deck_output, seen_height
+from estimation.deck import add_drift, change_motion, deck_output, seen_place
 from estimation.frames import Array
 from estimation.outcome import Outcome
 from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
-from estimation.state import ATTITUDE, Layout, plus
+from estimation.state import ATTITUDE, PL0, Layout, plus
 from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
 
 if TYPE_CHECKING:
@@ -81,7 +81,9 @@ class FilterPyEngine:
             t = int(rows.t_ns[i])
             self._propagate(t, t_imu, imu)
             if rows.kind[i] == HEAVE_MODEL:
-                s.heave[0], s.heave[1:] = rows.own[i, 0], rows.value[i]
+                motion = np.concatenate((rows.own[i, :1], rows.value[i], rows.own[i, 1:5]))
+                chain = self.trail.chain[self.trail.count[0]] if self.trail.on else np.empty((0, 0))
+                change_motion(s.x, s.P, s.heave, motion, self.layout.offsets, chain)
                 rows.outcome[i] = Outcome.FUSED
                 continue
             if i < following:
@@ -161,7 +163,7 @@ class FilterPyEngine:
         rows.result[i, 5 : 5 + m] = np.sqrt(np.diag(S))
         rows.log_det[i] = np.linalg.slogdet(S)[1]
         if kind == models.VISION:
-            rows.seen[i] = seen_height(r, R, s.x, self.p)
+            seen_place(r, R, s.x, self.p, rows.seen[i])
         w = update.weight(nis, m, self.p)
         if w == 0.0:
             rows.outcome[i] = Outcome.REJECTED_GATE
@@ -184,6 +186,7 @@ class FilterPyEngine:
         held = s.P[first:stop, first:stop].copy()
         error[first:stop] = 0.0
         s.x = plus(s.x, error, self.layout.offsets)
+        rows.seen[i, 6] = s.x[PL0]
         P = ekf.P
         att = int(self.layout.offsets[ATTITUDE])
         G = models.right_jacobian(error[att : att + 3])
@@ -216,6 +219,7 @@ class FilterPyEngine:
         if out.deck.shape[1]:
             out.deck[k], A = deck_output(s.x, s.heave, self.layout.offsets, self.layout.size)
             out.deck_covariance[k] = A @ s.P @ A.T
+            add_drift(s.heave, out.deck_covariance[k])
         out.count = k + 1
 
 

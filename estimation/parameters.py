@@ -78,13 +78,10 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     LATENCY_WALK,
     LATENCY_RATE,
     LATENCY,
-    OFFSET_WALK,
-    SWAY_SIGMA,
-    SWAY_OMEGA,
     SWAY_ZETA,
     LEVEL_WALK,
     SIZE,
-) = range(70)
+) = range(67)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,9 +133,7 @@ def pack_parameters(config: Config, site: Site) -> Array:
     mount = quat_to_matrix(euler_to_quat(*v.mount_rpy_rad))
     p[VISION_MOUNT : VISION_MOUNT + 9] = (R_CB_NOMINAL @ mount.T).ravel()
     p[LATENCY_WALK], p[LATENCY_RATE], p[LATENCY] = v.latency_walk, v.latency_rate_radps, v.latency_s
-    p[OFFSET_WALK], p[LEVEL_WALK] = d.offset_walk, d.level_walk
-    p[SWAY_SIGMA], p[SWAY_ZETA] = d.sway_sigma_m, d.sway_damping
-    p[SWAY_OMEGA] = 2.0 * math.pi / d.sway_period_s
+    p[SWAY_ZETA], p[LEVEL_WALK] = d.sway_damping, d.level_walk
     for dof in (1, 2, 3):
         p[HUBER_1 + dof - 1] = chi_square_bound(c.filter.huber_sigma, dof)
         p[GATE_1 + dof - 1] = chi_square_bound(c.filter.gate_sigma, dof)

@@ -22,22 +22,23 @@ PENDING = -1
 
 T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = range(10)
 """Columns of ``Rows.ints``."""
-VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 22, 23
+VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 27, 28
 """First columns in ``Rows.floats``, and their number."""
 HEAVE_MODEL = 10
-"""Kind of a row that is no measurement: from here on the heave has the seven parameters in ``value`` and ``own``."""
+"""Kind of a row that is no measurement: from here on the platform moves with the parameters in ``value``, ``own``."""
 
 
 @dataclass(slots=True)
 class Rows:
-    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 23), with a view for each column.
+    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 28), with a view for each column.
 
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
     the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
     the inertial clock was past the content when it arrived. ``value`` and ``own`` (n, 6) are the event's value and
     covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved) and ``result`` (n, 8):
-    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 2): height of the deck as a fix shows
-    it [m] and its variance, and ``log_det``: logarithm of the determinant of the innovation's covariance.
+    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 7): where a fix shows the deck
+    (``estimation.deck.seen_place``) and the level after it was fused [m], and ``log_det``: logarithm of the determinant
+    of the innovation's covariance.
     """
 
     ints: Int
@@ -121,7 +122,7 @@ class Rows:
 
     @property
     def seen(self) -> Array:
-        """Height of the deck as a fix shows it [m], and its variance [m^2]."""
+        """Height, north and east of the deck as a fix shows it [m], each with its variance; the level after it."""
         return self.floats[:, SEEN:LOG_DET]
 
     @property
@@ -200,7 +201,7 @@ class FilterState:
 
     ``clock`` holds the state's time, the last inertial sample's and the start's [ns]; ``imu`` that sample;
     ``scatter`` the vibration measure and the mean squared rotation; ``memory`` what is remembered of each sensor;
-    ``heave`` (7,) the deck's parameters.
+    ``heave`` the parameters of the deck's motion (``estimation.deck``).
     """
 
     clock: Int

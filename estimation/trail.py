@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimation.deck import MOTION_SIZE
 from estimation.frames import Array
 from estimation.rows import Int
 from estimation.state import NOMINAL_SIZE, Layout
@@ -28,7 +29,7 @@ class Trail:
 
     ``t_ns`` (m,); ``marks`` (m, 3); ``nominal`` (m, 2, NOMINAL_SIZE) and ``covariance`` (m, 2, n, n) before and after
     the node's measurements; ``chain`` (m + 1, n, n) the error state's transition from the node before to this one
-    (that behind the last node is still growing); ``heave`` (m, 7) the deck's parameters. A node at which the filter
+    (that behind the last node is still growing); ``heave`` (m, 11) the deck's parameters. A node at which the filter
     was moved onto a sensor has the state after that move in both places: the move belongs to the transition.
     """
 
@@ -50,7 +51,7 @@ class Trail:
             np.empty((m, 2, NOMINAL_SIZE)),
             np.empty((m, 2, n, n)),
             np.empty((m + 1 if m else 0, n, n)),
-            np.empty((m, 7)),
+            np.empty((m, MOTION_SIZE)),
         )
 
     @classmethod

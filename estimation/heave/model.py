@@ -97,8 +97,21 @@ class HeaveModel:
 
     @property
     def hs_m(self) -> float:
-        """Significant wave height of the deck's own motion: four standard deviations [m]."""
-        return 4.0 * self.sd_m
+        """Significant wave height of the deck's own motion in the window [m]: four standard deviations.
+
+        Of what was seen, about its mean and trend, with what is uncertain of it; a spectrum's power is less well known,
+        from a few waves of a regular motion most of all.
+        """
+        if self.learned is None or self.span_s <= 0:
+            return 4.0 * self.sd_m
+        c = self.coefficients
+        time = np.linspace(-self.span_s, 0.0, max(16, int(4.0 * self.span_s)))
+        rows = c.basis.values(time)
+        rows[:, c.level] = 0.0
+        trend, _ = np.linalg.qr(np.column_stack([np.ones_like(time), time]))
+        rows -= trend @ (trend.T @ rows)
+        variance = np.mean((rows @ c.mean) ** 2) + np.mean((rows @ c.covariance * rows).sum(axis=1))
+        return 4.0 * math.sqrt(max(0.0, float(variance)))
 
     @property
     def tp_s(self) -> float:

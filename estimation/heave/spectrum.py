@@ -40,6 +40,9 @@ class SpectrumSettings:
     """How a spectrum is learned."""
 
     lowest_hz: float = 0.03
+    lowest_cycles: float = 1.5
+    """Motion with fewer cycles in the window than this is level and drift: that it comes back has not been seen, and a
+    spectrum learned from it could be of any size."""
     highest_hz: float = 1.3
     horizon_s: float = 10.0
     """Longest forecast that the frequency grid must serve."""
@@ -176,7 +179,8 @@ def learn(
 
     settings = settings or SpectrumSettings()
     span = grid_span(window)
-    basis = dense_basis(span, window.interval_s, settings.lowest_hz, settings.highest_hz, settings.horizon_s)
+    lowest = max(settings.lowest_hz, settings.lowest_cycles / span)
+    basis = dense_basis(span, window.interval_s, lowest, settings.highest_hz, settings.horizon_s)
     problem = _compress(window, basis, settings)
     bumps = _bumps(basis.frequency_hz, span, settings)
     first, top = _first_guess(window, basis, settings)
@@ -191,7 +195,7 @@ def learn(
         ]
     )
     where = 4 * PEAKS
-    band = (math.log(settings.lowest_hz), math.log(basis.frequency_hz[-1]))
+    band = (math.log(lowest), math.log(basis.frequency_hz[-1]))
     bounds = [(top - 8.0, top + 3.0), band, (0.0, 2.0), (3.0, 14.0)] * PEAKS
     bounds += [(-16.0, 0.0), (-8.0, 8.0)] + [(-4.0, 4.0)] * bumps.shape[1]
     low, high = np.array(bounds).T
@@ -275,7 +279,7 @@ def _first_guess(window: Window, basis: Basis, settings: SpectrumSettings) -> tu
         2.0 * np.pi * (t - t[0] + 0.5 * window.interval_s) / (span + window.interval_s)
     )
     frequency = np.arange(1, max(3, int(basis.frequency_hz[-1] * span)) + 1) / span
-    frequency = frequency[(frequency >= settings.lowest_hz) & (frequency <= basis.frequency_hz[-1])]
+    frequency = frequency[(frequency >= basis.frequency_hz[0]) & (frequency <= basis.frequency_hz[-1])]
     level = float(taper @ window.value_m / taper.sum())
     line = np.exp(-2j * np.pi * np.outer(frequency, t)) @ (taper * (window.value_m - level))
     noise = window.noise_density_m2ps

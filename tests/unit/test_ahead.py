@@ -21,6 +21,7 @@ SWAY = np.array([0.2, -0.1, 0.05, 0.3])
 
 CONFIG = parse_config("[platform]\nuse = true\n")
 SWING = np.array([2.0 * math.pi / CONFIG.platform.sway_period_s, CONFIG.platform.sway_damping])
+MOTION = np.array([*HEAVE, 0.1, 0.1, SWING[0], 0.05])
 
 
 def some_heave() -> tuple[np.ndarray, np.ndarray]:
@@ -42,7 +43,7 @@ def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
     for _ in range(160):
         F, Q = np.eye(layout.size), np.zeros((layout.size, layout.size))
         y = x.copy()
-        deck_transition(x, y, 0.005, p, HEAVE, layout.offsets, F, Q)
+        deck_transition(x, y, 0.005, p, MOTION, layout.offsets, F, Q)
         x = y
         covariance = F[block, block] @ covariance @ F[block, block].T + Q[block, block]
     rate = heave_matrix(HEAVE)[5]

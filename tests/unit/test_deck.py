@@ -6,22 +6,51 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from estimation import parameters as par
 from estimation.config import parse_config
-from estimation.deck import deck_output, deck_transition, heave_matrix, heave_stationary, seen_height, vision
+from estimation.deck import (
+    SWAY_NORTH,
+    SWAY_OMEGA,
+    change_motion,
+    deck_output,
+    deck_transition,
+    heave_derivatives,
+    heave_matrix,
+    heave_moments,
+    heave_states,
+    heave_stationary,
+    seen_place,
+    vision,
+)
 from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_to_matrix
 from estimation.parameters import Site, pack_parameters
-from estimation.state import CL0, CM0, P0, PH0, PL0, PO0, PS0, Q0, RS0, V0, Layout, nominal_zero, plus
+from estimation.state import (
+    CL0,
+    CM0,
+    P0,
+    PH0,
+    PL0,
+    PLATFORM_HEAVE,
+    PO0,
+    PS0,
+    Q0,
+    RS0,
+    V0,
+    Layout,
+    nominal_zero,
+    plus,
+)  # fmt: skip
 
 CONFIG = parse_config(
     "[platform]\nuse = true\n[vision]\nlever_arm_m = [0.1, -0.05, 0.2]\nmount_rpy_rad = [0.02, -0.03, 0.1]\n"
 )
 LAYOUT = Layout.of(CONFIG)
 P = pack_parameters(CONFIG, Site((0.9, 0.1, 50.0), 0.0))
-HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4])
+HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4, 0.1, 0.2, 1.1, 0.05])
 GYRO = np.array([0.2, -0.3, 0.1])
 Array = NDArray[np.float64]
 
@@ -108,7 +137,7 @@ def test_the_stationary_covariance_stays_as_it_is() -> None:
     sway = slice(LAYOUT.names.index("platform_sway.n"), LAYOUT.names.index("platform_sway.n") + 2)
     after = F[block, block] @ stationary @ F[block, block].T + Q[block, block]
     assert after == pytest.approx(stationary, abs=1e-4 * stationary.max())
-    s = np.diag([P[par.SWAY_SIGMA] ** 2, (P[par.SWAY_SIGMA] * P[par.SWAY_OMEGA]) ** 2])
+    s = HEAVE[SWAY_NORTH] ** 2 * np.diag([1.0, HEAVE[SWAY_OMEGA] ** 2])
     assert F[sway, sway] @ s @ F[sway, sway].T + Q[sway, sway] == pytest.approx(s, abs=1e-5)
 
 
@@ -126,13 +155,95 @@ def test_what_is_reported_is_the_difference_and_its_jacobian() -> None:
         assert change / step == pytest.approx(A[:, k], abs=1e-6)
 
 
-def test_a_fix_that_is_too_short_shows_a_higher_deck() -> None:
+def test_a_fix_that_is_too_short_shows_a_higher_deck_and_one_aside_another_place() -> None:
     x = nominal_zero()
     x[P0 + 2] = -10.0
     p = pack_parameters(parse_config("[platform]\nuse = true\n"), Site((0.9, 0.1, 50.0), 0.0))
-    height, variance = seen_height(np.array([0.0, 0.0, -0.2]), np.diag([0.1, 0.2, 0.3]), x, p)
-    assert height == pytest.approx(0.2)
-    assert variance == pytest.approx(0.3)
+    seen = np.zeros(6)
+    # Camera axes of a level camera: X east, Y south, Z down.
+    seen_place(np.array([0.4, -0.1, -0.2]), np.diag([0.1, 0.2, 0.3]), x, p, seen)
+    assert seen == pytest.approx([0.2, 0.3, 0.1, 0.2, 0.4, 0.1])
     assert quat_to_matrix(x[Q0 : Q0 + 4]) @ R_CB_NOMINAL.T @ np.array([0, 0, 1.0]) == pytest.approx(
         [0, 0, 1.0]
     )
+
+
+def motion(rng: np.random.Generator) -> Array:
+    """Return parameters of some motion (11,): heave sections of 1 to 14 s and of every damping."""
+    return np.array(
+        [rng.uniform(0.05, 2.0), *rng.uniform(0.44, 6.0, 3), *np.exp(rng.uniform(np.log(0.02), 0.7, 3)),
+         0.1, 0.2, 1.1, 0.05]
+    )  # fmt: skip
+
+
+def shown(heave: Array) -> Array:
+    """Return the rows (3, 6) that take the chain's states to heave, rate and acceleration."""
+    f, unit = heave_matrix(heave), np.eye(6)[5]
+    return np.stack([unit, unit @ f, unit @ f @ f])
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_heaves_derivatives_are_another_form_of_its_states(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    heave, x = motion(rng), rng.normal(size=6)
+    z = heave_derivatives(x, heave)
+    assert heave_states(z, heave) == pytest.approx(x, abs=1e-9)
+    assert shown(heave) @ x == pytest.approx(z[3:], rel=1e-9, abs=1e-9)
+    to = np.column_stack([heave_derivatives(unit, heave) for unit in np.eye(6)])
+    assert np.diag(to @ heave_stationary(heave) @ to.T) == pytest.approx(heave_moments(heave), rel=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_new_model_leaves_heave_rate_and_acceleration_what_they_are(seed: int) -> None:
+    """With all that is known of them, of anything else, and of the two together; and P stays a covariance."""
+    rng = np.random.default_rng(seed)
+    old, new = motion(rng), motion(rng)
+    n, start = LAYOUT.size, LAYOUT.offsets[PLATFORM_HEAVE]
+    block, x = slice(start, start + 6), nominal_zero()
+    x[PH0 : PH0 + 6] = rng.normal(size=6)
+    A = rng.normal(size=(n, n))
+    P, before = A @ A.T, x.copy()
+    was, heave = P.copy(), old.copy()
+    chain = np.eye(n)
+    change_motion(x, P, heave, new, LAYOUT.offsets, chain)
+    assert np.array_equal(heave, new)
+    assert chain @ was @ chain.T == pytest.approx(P, rel=1e-6, abs=1e-6 * np.abs(P).max())
+    assert shown(new) @ x[PH0 : PH0 + 6] == pytest.approx(
+        shown(old) @ before[PH0 : PH0 + 6], rel=1e-9, abs=1e-8
+    )
+    rest = np.vstack([np.delete(np.eye(n), block, axis=0), np.zeros((3, n))])
+    C, D = rest.copy(), rest.copy()
+    C[-3:, block], D[-3:, block] = shown(old), shown(new)
+    kept = C @ was @ C.T
+    assert pytest.approx(kept, rel=1e-6, abs=1e-6 * np.abs(kept).max()) == D @ P @ D.T
+    assert np.linalg.eigvalsh(P)[0] > -1e-12 * np.trace(P)
+    assert np.array_equal(np.delete(x, range(PH0, PH0 + 6)), np.delete(before, range(PH0, PH0 + 6)))
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_same_model_taken_up_again_changes_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    heave, x = motion(rng), nominal_zero()
+    x[PH0 : PH0 + 6] = rng.normal(size=6)
+    A = rng.normal(size=(LAYOUT.size, LAYOUT.size))
+    P, before = A @ A.T, x.copy()
+    was = P.copy()
+    change_motion(x, P, heave, heave.copy(), LAYOUT.offsets, np.empty((0, 0)))
+    assert x == pytest.approx(before, abs=1e-9)
+    assert pytest.approx(was, abs=1e-8) == P
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_sea_of_which_only_the_heave_is_known_becomes_the_new_one(seed: int) -> None:
+    """What the old sea leaves open of the integrals, once the heave is known, the new one leaves open too."""
+    rng = np.random.default_rng(seed)
+    old, new = motion(rng), motion(rng)
+    P, x, start = np.zeros((LAYOUT.size, LAYOUT.size)), nominal_zero(), LAYOUT.offsets[PLATFORM_HEAVE]
+    block = slice(start, start + 6)
+    P[block, block] = heave_stationary(old)
+    change_motion(x, P, old.copy(), new, LAYOUT.offsets, np.empty((0, 0)))
+    S, C = heave_stationary(new), shown(new)
+    G = S @ C.T @ np.linalg.inv(C @ S @ C.T)
+    y = shown(old) @ heave_stationary(old) @ shown(old).T
+    wanted = G @ y @ G.T + S - G @ C @ S
+    assert P[block, block] == pytest.approx(wanted, rel=1e-3, abs=1e-5 * np.abs(wanted).max())

@@ -65,7 +65,7 @@ use = true
 LAYOUT = Layout.of(CONFIG)
 P = pack_parameters(CONFIG, SITE)
 NO_COVARIANCE = np.full(6, np.nan)
-HEAVE = np.array([0.4, 0.9, 1.3, 1.1, 0.3, 0.4, 0.5])
+HEAVE = np.array([0.4, 0.9, 1.3, 1.1, 0.3, 0.4, 0.5, 0.1, 0.2, 0.8, 0.05])
 """Gain, three angular frequencies and three dampings of a heaving deck."""
 
 numbers = st.floats(-1.0, 1.0)
