@@ -290,6 +290,11 @@ def _first_guess(window: Window, basis: Basis, settings: SpectrumSettings) -> tu
     fp, top = float(frequency[peak]), math.log(float(smooth[peak]) * spacing)
     first = [top, math.log(fp), PEAK_MEAN[2], PEAK_MEAN[3]]
     second = [top - 2.5, math.log(fp) + 0.5, PEAK_MEAN[2], PEAK_MEAN[3]]
+    # Another peak elsewhere, where there is one above the noise: a small sea beside a slow motion.
+    apart = np.abs(np.log(frequency / fp)) > 0.5
+    if np.any(apart & (smooth > noise)):
+        other = int(np.argmax(np.where(apart, smooth, 0.0)))
+        second[:2] = math.log(float(smooth[other]) * spacing), math.log(float(frequency[other]))
     return np.array(first + second), top
 
 

@@ -322,3 +322,27 @@ def test_extreme_ratios_of_motion_to_noise_are_solved(size: float, sigma: float)
     assert np.all(np.isfinite(mean))
     assert np.all(variance > 0)
     assert np.max(np.abs(mean - size * swell(t[-1] + AHEAD))) < 0.5 * size + 4 * sigma
+
+
+def test_a_small_sea_is_seen_beside_a_slow_wander_and_in_large_noise() -> None:
+    """2.5 cm of short waves in 12 cm of noise, and a wander of 20 cm as an altimeter has: nothing hides the rate."""
+    rng = np.random.default_rng(5)
+    t = np.arange(0.0, 50.0, 0.05)
+    f = rng.normal(0.6, 0.06, 40)
+    waves = np.sin(2.0 * np.pi * np.outer(t, f) + rng.uniform(0.0, 2.0 * np.pi, 40)).sum(axis=1)
+    waves *= 0.025 / waves.std()
+    wander = 0.2 * np.sin(2.0 * np.pi * t / 70.0)
+    model = heave.fit(t, waves + wander + 0.12 * rng.normal(size=len(t)), 0.12, window_s=60.0)
+    rate = math.sqrt(model.coefficients.rate_variance_m2ps2)
+    assert rate == pytest.approx(float(np.gradient(waves, t).std()), rel=0.4)
+    assert model.sd_m < 0.07
+
+
+def test_motion_that_was_not_seen_to_come_back_is_drift() -> None:
+    """A third of a slow swing fits any wave: it must not become one, of any height."""
+    rng = np.random.default_rng(6)
+    t = np.arange(0.0, 10.0, 0.1)
+    swing = 0.5 * np.sin(2.0 * np.pi * t / 30.0)
+    model = heave.fit(t, swing + 0.02 * rng.normal(size=len(t)), 0.02)
+    assert model.sd_m < 0.1
+    assert model.level_m == pytest.approx(swing[-1], abs=0.1)

@@ -15,7 +15,7 @@ from estimation.config import Config, parse_config
 from estimation.estimator import LandingEstimator
 from estimation.events import Event, EventBatch, GpsPosition, Kind
 from estimation.heave.model import HeaveModel
-from estimation.learning import HeaveLearner
+from estimation.learning import MotionLearner
 from estimation.output import Run
 from estimation.parameters import pack_parameters
 from estimation.rows import Rows
@@ -90,13 +90,13 @@ def test_considered_states_are_left_alone(both: tuple[Run, Run]) -> None:
 def test_both_engines_give_the_same(deck_flight: EventBatch, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a heave model taken up in flight; a given one, since learning is not the engines' part."""
     pytest.importorskip("numba", reason="the compiled engine needs numba")
-    taken = np.array([0.05, 1.2566, 1.2566, 1.1, 0.1, 0.1, 0.3])
+    taken = np.array([0.05, 1.2566, 1.2566, 1.1, 0.1, 0.1, 0.3, 0.2, 0.1, 1.3, 0.05])
     due_ns = int(deck_flight.rows["stamp_ns"].min()) + 8_000_000_000
 
-    def take(self: HeaveLearner, settled: Rows) -> list[tuple[int, HeaveModel | None, Array]]:
+    def take(self: MotionLearner, settled: Rows) -> list[tuple[int, HeaveModel | None, Array]]:
         return [(due_ns, None, taken)] if settled.t_ns[0] <= due_ns < settled.t_ns[-1] else []
 
-    monkeypatch.setattr(HeaveLearner, "take", take)
+    monkeypatch.setattr(MotionLearner, "take", take)
     one, other = (smoothed(deck_flight, parse_config(DECK), e) for e in ("compiled", "filterpy"))
     assert len(one[0].heave) == 1
     assert np.abs(one[0].deck - smoothed(deck_flight, parse_config(UNLEARNED))[0].deck).max() > 1e-3
