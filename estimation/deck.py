@@ -46,8 +46,8 @@ HEAVE_SIZE = 6
 HEAVE_PARAMETERS = 7
 SWAY_NORTH, SWAY_EAST, SWAY_OMEGA, OFFSET_WALK = 7, 8, 9, 10
 MOTION_SIZE = 11
-DRIFT_TIME_S = 10.0
-"""Correlation time of the velocity with which the place drifts; over longer times it is a random walk [s]."""
+DRIFT_TIME_S = 3.0
+"""After so long a random walk of the place is as far as the steady velocity that it stands for takes it [s]."""
 OUTPUT_SIZE = 8
 """Relative position (3), relative velocity (3), height and its rate."""
 
@@ -417,10 +417,7 @@ def deck_output(x: Array, heave: Array, offsets: Offsets, n: int) -> tuple[Array
 
 
 def add_drift(heave: Array, covariance: Array) -> None:
-    """Add to the covariance of what is reported, (8, 8), the velocity of the place's drift, which is no state.
-
-    A velocity of standard deviation v and correlation time T is, over longer times, a random walk of v sqrt(2 T).
-    """
-    variance = heave[OFFSET_WALK] ** 2 / (2.0 * DRIFT_TIME_S)
+    """Add to the covariance of what is reported, (8, 8), the velocity of the place's drift, which is no state."""
+    variance = heave[OFFSET_WALK] ** 2 / DRIFT_TIME_S
     covariance[3, 3] += variance
     covariance[4, 4] += variance

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation.deck import (
+    DRIFT_TIME_S,
     HEAVE_PARAMETERS,
     OFFSET_WALK,
     SWAY_NORTH,
@@ -180,17 +181,14 @@ def broad_heave(sigma_m: float, rate_mps: float, damping: float) -> Array:
 
 
 def _walk(model: HeaveModel) -> float:
-    """Return the random walk [m/rts] that is as fast, at periods longer than a sway's, as the motion seen was.
-
-    A random walk of q has the one-sided density 2 q^2 of velocity at every frequency.
-    """
+    """Return the random walk [m/rts] that stands for the motion seen at periods longer than a sway's."""
     assert model.learned is not None
     basis, mean = model.coefficients.basis, model.coefficients.mean.copy()
     fast = np.flatnonzero(model.frequency_hz >= SWAY_LOWEST_HZ)
     mean[fast] = mean[len(model.frequency_hz) + fast] = 0.0
     time = np.linspace(-model.span_s, 0.0, max(16, int(model.span_s)))
     velocity = basis.rates(time) @ mean
-    return math.sqrt(float(np.mean(velocity**2)) / (2.0 * SWAY_LOWEST_HZ))
+    return math.sqrt(float(np.mean(velocity**2)) * DRIFT_TIME_S)
 
 
 def _in_sea(omega_radps: float) -> float:
