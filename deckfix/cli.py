@@ -191,13 +191,45 @@ def recover(file: str, output: str, force: bool) -> None:
 
 @deckfix.command()
 @click.argument("scenario")
-@click.option("-o", "--output", required=True, metavar="F.mcap", help="The log to write.")
+@click.option("-o", "--output", metavar="F.mcap", help="The log to write.")
 @click.option("--seed", type=int, help="Of the flight (default: the scenario's).")
+@click.option(
+    "--serve", is_flag=True, help="Fly a mission in real time, with MAVLink and a camera on the loopback."
+)
+@click.option("--mavlink-port", default=14550, show_default=True, metavar="N", help="Where onboard listens.")
+@click.option(
+    "--camera-port", default=8090, show_default=True, metavar="N", help="Where the camera is served."
+)
+@click.option(
+    "--flight-files", metavar="DIR", help="Write flight.toml, camera.toml and target.toml for onboard."
+)
 @_FORCE
-def simulate(scenario: str, output: str, seed: int | None, force: bool) -> None:
-    """Write the log of a simulated flight: a scenario's name or TOML file, and a seed."""
+def simulate(
+    scenario: str,
+    output: str | None,
+    seed: int | None,
+    serve: bool,
+    mavlink_port: int,
+    camera_port: int,
+    flight_files: str | None,
+    force: bool,
+) -> None:
+    """Write the log of a simulated flight: a scenario's name or TOML file, and a seed.
+
+    With --serve the vehicle of a mission waits for deckfix onboard, in another terminal, to land it.
+    """
+    if serve:
+        from deckfix.serving import Ports, serve_command
+
+        ports = Ports(mavlink_port, camera_port)
+        _say(
+            serve_command(scenario, output, seed=seed, ports=ports, files=flight_files, force=force, say=_say)
+        )
+        return
     from deckfix.demo import simulate_flight
 
+    if output is None:
+        raise click.UsageError("Missing option '-o' / '--output'.")
     _say(simulate_flight(scenario, output, seed=seed, force=force))
 
 

@@ -106,7 +106,7 @@ def summary_lines(flight: object) -> list[str]:
     lines = [
         f"{c['estimates']} estimates, {c['images']} images, {c['fixes']} fixes, {c['fused fixes']} fused, "
         f"{flight.link.sent['LANDING_TARGET']} LANDING_TARGET sent",
-        flight.latency_words(),
+        f"{flight.latency_words()}; {flight.load.words}",
     ]
     turned = {**flight.link.counts, **flight.link.sensors.counts_turned_away}
     if turned:

@@ -12,19 +12,23 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
+
 from deckfix.camera_source import CameraSource
 from deckfix.files import InputError, existing
 from deckfix.flight_file import FlightFile
 from deckfix.guide import Guide
 from deckfix.intake import CompanionClock, Intake
 from deckfix.mavlink_link import Link
-from deckfix.onboard import Onboard
+from deckfix.onboard import HORIZONS_S, Onboard
 from deckfix.pipeline import Pipeline
 from deckfix.recorder import Recorder, log_path
 from deckfix.stream_requests import StreamRequests
 from deckfix.transport import open_transport
+from estimation.ahead import DeckForecaster
 from estimation.config import Config, ConfigError
 from estimation.estimator import EngineName, LandingEstimator
+from estimation.heave.model import fit
 from estimation.output import Facts
 from logs.ardupilot import filter_delay
 from simulation.flight import parse_scenario, simulate
@@ -162,16 +166,17 @@ def warm_up(setup: FlightFile, engine: EngineName) -> None:
 
 
 def warm_estimator(config: Config, engine: EngineName) -> None:
-    """Run the estimator over a few simulated seconds."""
+    """Run the estimator over a few simulated seconds, with what it does only now and then: heave and forecasts."""
     estimator = LandingEstimator(config, engine=engine)
     for event in simulate(parse_scenario(_WARM_UP)).batch:
         estimator.step(event)
+    estimator.deck_forecast(DeckForecaster.at(HORIZONS_S))
+    t = np.arange(0.0, 20.0, 0.05)
+    fit(t, 0.2 * np.sin(t), np.full(len(t), 0.02), window_s=60.0).band_pass()
 
 
 def warm_detector(camera: Camera, target: RingTarget) -> None:
     """Let the detector look at a rendered image."""
-    import numpy as np
-
     from estimation.frames import R_CB_NOMINAL
     from simulation.renderer import Renderer
     from vision.detector import TargetDetector

@@ -21,6 +21,7 @@ from deckfix.guide import Guide, set_point
 from deckfix.health import Health, Problem
 from deckfix.intake import CompanionClock, Intake
 from deckfix.landing_target import RATE_HZ, Newest, landing_target, odometry, target_in_body, why_not
+from deckfix.load import Load
 from deckfix.mavlink_link import LAND, Link
 from deckfix.pipeline import ImageEvent, Pipeline, Step
 from deckfix.recorder import ERROR, INFO, WARN, Recorder
@@ -93,6 +94,7 @@ class Onboard:
     last_image: ImageEvent | None = None
     counts: Counter[str] = field(default_factory=Counter)
     latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
+    load: Load = field(default_factory=Load)
     _open: bool = False
     _imu_ns: int = 0
     _sync_ns: int = 0
@@ -133,7 +135,7 @@ class Onboard:
 
     def run(self) -> None:
         """Estimate until ``stop`` is set."""
-        self._open, self._began_ns = True, self.clock()
+        self._open, self._began_ns, self.load = True, self.clock(), Load()
         threads = [
             threading.Thread(target=self._read, name="link", daemon=True),
             threading.Thread(target=self._duties, name="duties", daemon=True),
@@ -286,7 +288,7 @@ class Onboard:
                 self.requests.check(self.link, now)
             case _:
                 if self.recorder is not None:
-                    self.recorder.say(now, INFO, self.latency_words())
+                    self.recorder.say(now, INFO, f"{self.latency_words()}; {self.load.words}")
 
     def _send_target(self) -> bool:
         """Tell the autopilot where the deck is, if that is known; return whether it was sent."""

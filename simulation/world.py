@@ -117,7 +117,7 @@ def fly(
     ``guidance`` decides (the landing modes); ``camera`` sees the target in place of fixes drawn from the description;
     ``watch`` is told the time and the last decision at every tick.
     """
-    world = _World(mission, mission.seed if seed is None else seed, engine, guidance, camera)
+    world = World(mission, mission.seed if seed is None else seed, engine, guidance, camera)
     while not world.end:
         world.tick()
         if watch is not None:
@@ -126,7 +126,9 @@ def fly(
 
 
 @dataclass(slots=True)
-class _World:
+class World:
+    """A mission as it is flown, tick by tick, until ``end`` says how it ended."""
+
     mission: Mission
     seed: int
     engine: EngineName
