@@ -34,7 +34,8 @@ from vision import Camera, RingTarget
 
 CAMERA = Camera.preset("rpi-v2-640x480")
 TARGET = RingTarget.recommended()
-SECONDS = 7.0
+LONGEST_S = 90.0
+"""A flight ends once all has been seen; a busy machine may take its time."""
 
 
 def free_port() -> int:
@@ -99,6 +100,11 @@ def attack(autopilot: ScriptedAutopilot, flight: Onboard) -> None:
     send(autopilot.packed(autopilot.imu(autopilot.boot_us() + 1, xacc=math.nan)), autopilot.address)
     question = autopilot.messages.MAVLink_timesync_message(0, 987_654_321)
     send(autopilot.packed(question), autopilot.address)
+    while not flight.stop.wait(0.1):
+        told = len(autopilot.heard("LANDING_TARGET"))
+        if told > 60 and len(flight.latencies_ms) > 20 and flight.counts["estimates"] > 150:
+            flight.stop.wait(1.0)
+            flight.stop.set()
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +123,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
         flight = prepare(options, setup(), said.append)
         show_images(flight)
         threading.Thread(target=attack, args=(autopilot, flight), daemon=True).start()
-        fly(flight, SECONDS)
+        fly(flight, LONGEST_S)
         patch.undo()
         yield Flown(flight, autopilot, log)
 
@@ -197,8 +203,8 @@ def test_what_must_be_turned_away_is_counted_and_moves_nothing(flown: Flown) -> 
 
 
 def test_clocks_are_compared_both_ways(flown: Flown) -> None:
-    asked = [m for m in flown.autopilot.heard("TIMESYNC") if m.tc1 == 0]
-    assert 4.0 * SECONDS <= len(asked) <= 10.0 * SECONDS
+    asked = [t for t, m in flown.autopilot.got if m.get_type() == "TIMESYNC" and m.tc1 == 0]
+    assert 4.0 <= (len(asked) - 1) / (asked[-1] - asked[0]) <= 10.0
     (answer,) = [m for m in flown.autopilot.heard("TIMESYNC") if m.ts1 == 987_654_321]
     assert answer.tc1 > 0
     (clock,) = [c for c in flown.flight.status.clocks if c.clock == "companion"]
@@ -254,7 +260,7 @@ def test_a_lost_link_stops_what_is_sent_and_is_survived(
     with ScriptedAutopilot(port) as autopilot:
         flight = prepare(Options(f"udpin:127.0.0.1:{port}", engine="filterpy"), setup(), lambda text: None)
         show_images(flight)
-        thread = threading.Thread(target=fly, args=(flight, 30.0))
+        thread = threading.Thread(target=fly, args=(flight, LONGEST_S))
         thread.start()
         try:
             wait(lambda: len(autopilot.heard("LANDING_TARGET")) > 5)
@@ -273,7 +279,7 @@ def test_a_lost_link_stops_what_is_sent_and_is_survived(
     assert not thread.is_alive()
 
 
-def wait(condition: object, seconds: float = 12.0) -> None:
+def wait(condition: object, seconds: float = 40.0) -> None:
     assert callable(condition)
     until = time.monotonic() + seconds
     while not condition():
