@@ -30,7 +30,7 @@ _UNFINISHED_NS = 3_000_000_000
 
 
 def check_replay(
-    result: Result, config: Config | str | Path | None, engine: EngineName
+    result: Result, config: Config | str | Path | None, engine: EngineName, jobs: int | None = None
 ) -> tuple[bool, list[str]]:
     """Replay a result's log anew, and compare: the files of both replays, and estimates that the log
     recorded.
@@ -42,7 +42,8 @@ def check_replay(
     if result.source is None:
         raise ValueError("this result did not come from a log")
     path = Path(result.source.path)
-    again = replay(path, config, engine, smooth=result.smoothed is not None)
+    looked_at = result.images is not None and result.images.source == "images"
+    again = replay(path, config, engine, smooth=result.smoothed is not None, images=looked_at, jobs=jobs)
     said = []
     with tempfile.TemporaryDirectory(prefix="deckfix-") as folder:
         first, second = Path(folder) / "first.mcap", Path(folder) / "second.mcap"

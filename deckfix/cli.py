@@ -87,16 +87,32 @@ def deckfix() -> None:
 @click.option(
     "--system", type=int, metavar="N", help="MAVLink id of the vehicle, where a .tlog holds several."
 )
+@click.option("--video", metavar="V", help="The camera's recording: a video, or a folder of pictures.")
+@click.option(
+    "--stamps", metavar="S.csv", help="When each frame was taken: columns t_s (or t_ns), frame, clock."
+)
+@click.option(
+    "--offset", "offset_s", metavar="S",
+    help="What the frames' clock shows less the autopilot's [s]; t_flight = t_frame - S.",
+)  # fmt: skip
+@click.option("--camera", metavar="C.toml", help="The camera, as deckfix calibrate writes it.")
+@click.option("--target", metavar="T.toml", help="The target, as deckfix target writes it.")
 @_FORCE
-def import_(files: tuple[str, ...], output: str, system: int | None, force: bool) -> None:
+def import_(
+    files: tuple[str, ...], output: str, system: int | None, video: str | None, stamps: str | None,
+    offset_s: str | None, camera: str | None, target: str | None, force: bool,
+) -> None:  # fmt: skip
     """Turn flight logs into one MCAP log.
 
     Takes ArduPilot .BIN and .log, MAVLink .tlog and PX4 .ulg; an autopilot's log and the telemetry log of the
-    same flight are joined by their clocks.
+    same flight are joined by their clocks. What a camera saw can be added, to an MCAP log too: its video, its
+    calibration, and the target.
     """
     from deckfix.importing import import_flight
+    from deckfix.video_import import Extras
 
-    _say(import_flight(files, output, system=system, force=force))
+    extras = Extras.of(video, stamps, offset_s, camera, target)
+    _say(import_flight(files, output, system=system, extras=extras, force=force))
 
 
 @deckfix.command()
@@ -123,6 +139,12 @@ def info(file: str) -> None:
 @click.option(
     "--smooth", is_flag=True, help="Smooth as well: /smoothed topics, from what came before and after."
 )
+@click.option(
+    "--images/--no-images",
+    default=None,
+    help="Look at the log's images for fixes; never.  [default: where the log holds no vision fixes]",
+)
+@_JOBS
 @_FORCE
 def replay(
     file: str,
@@ -133,14 +155,19 @@ def replay(
     engine: str,
     check: bool,
     smooth: bool,
+    images: bool | None,
+    jobs: int | None,
     force: bool,
 ) -> None:
-    """Run the estimator over a log."""
+    """Run the estimator over a log.
+
+    Its images become vision fixes where it carries the camera and the target (deckfix import --camera --target).
+    """
     from deckfix.commands import replay_command
 
     text, equal = replay_command(
         file, output=output, report=report_path, json_path=json_path, config=config_path, engine=engine,
-        check=check, force=force, smooth=smooth,
+        check=check, force=force, smooth=smooth, images=images, jobs=jobs,
     )  # fmt: skip
     _say(text)
     if not equal:

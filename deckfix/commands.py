@@ -27,6 +27,8 @@ def replay_command(
     check: bool,
     force: bool,
     smooth: bool = False,
+    images: bool | None = None,
+    jobs: int | None = None,
 ) -> tuple[str, bool]:
     """Replay a log, write what was asked for, and return the text to show and whether the check held."""
     from deckfix.replaying import replay
@@ -39,7 +41,7 @@ def replay_command(
         check_output(path, force=force, inputs=inputs)
     _distinct(written)
     with working(f"replaying {Path(file).name}"):
-        result = replay(file, config, cast("EngineName", engine), smooth=smooth)
+        result = replay(file, config, cast("EngineName", engine), smooth=smooth, images=images, jobs=jobs)
     if output:
         result.write(output, force=force, inputs=inputs)
     if report:
@@ -52,7 +54,7 @@ def replay_command(
         from deckfix.check import check_replay
 
         with working("checking"):
-            equal, verdict = check_replay(result, config, cast("EngineName", engine))
+            equal, verdict = check_replay(result, config, cast("EngineName", engine), jobs)
     if to_stdout:
         return document.rstrip("\n"), equal
     lines = [digest(result), *verdict, *(f"wrote {p}" for p in written)]
@@ -102,6 +104,8 @@ def digest(result: Result) -> str:
         f"{fused} of {len(records)} measurements fused ({result.run.engine}, {result.wall_s:.2f} s)",
         verdict(result, found),
     ]
+    if result.images is not None:
+        lines.append(f"  {result.images.sentence()}")
     lines += [
         f"  {f.severity.name.lower()}: {f.symptom} ({f.remedy})" for f in found if f.severity > Severity.NOTE
     ]

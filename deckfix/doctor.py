@@ -23,8 +23,11 @@ REQUIRED = (
     "msgspec", "click", "rich", "joblib", "plotly", "pygeomag",
 )  # fmt: skip
 OPTIONAL = {
-    "numba": "the compiled engine (deckfix[fast])",
+    "numba": "the compiled engines of filter and detector (deckfix[fast])",
     "pyulog": "importing PX4 .ulg (deckfix[px4])",
+    "foxglove-sdk": "watching a flight live in Foxglove (deckfix[live])",
+    "distributed": "fleets on a Dask cluster (deckfix[cluster])",
+    "av": "exact times of a video's frames; OpenCV reads them without it (deckfix[video])",
     "pandas": "Result.to_pandas()",
     "pyarrow": "export --format parquet",
 }
@@ -67,6 +70,7 @@ def _software() -> Iterable[Check]:
     for name in REQUIRED:
         version = _version(name)
         yield Check(name, version or "missing", "" if version else f"pip install '{name}'")
+    yield _opencv()
     filterpy = _version("filterpy")
     if filterpy and int(filterpy.split(".")[0]) < 2:
         yield Check(
@@ -74,6 +78,21 @@ def _software() -> Iterable[Check]:
         )
     for name, use in OPTIONAL.items():
         yield Check(name, _version(name) or f"not installed; needed for {use}")
+
+
+def _opencv() -> Check:
+    """Check that OpenCV can be loaded, which a second distribution of it or a missing library prevents."""
+    try:
+        import cv2
+
+        said = str(cv2.getBuildInformation())
+    except Exception as error:  # a broken installation raises whatever its loader does
+        return Check(
+            "OpenCV", f"cannot be loaded ({error})", "pip install --force-reinstall opencv-python-headless"
+        )
+    reads = any("FFMPEG" in line and "YES" in line for line in said.splitlines())
+    without = "" if reads or _version("av") else "; it reads no video, install deckfix[video] for that"
+    return Check("OpenCV", f"{cv2.__version__}{without}")
 
 
 def _version(name: str) -> str | None:

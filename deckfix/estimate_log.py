@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 OURS = ("/estimate/", "/smoothed/", "/fusion", "/heave/")
 """Topics that a replay writes; those of an earlier replay are not copied."""
+VISION = "deckfix.vision"
+"""Metadata record that tells what the images showed that the fixes in a log come from."""
 SOFTWARE = "deckfix.estimate"
 """Metadata record that tells what made the estimates."""
 
@@ -41,6 +43,7 @@ def write(
     that did not come from a log.
     """
     from deckfix.replaying import CONFIG_NAME
+    from logs.events import series_of_batch
     from logs.writer import FlightWriter
 
     flight = result.source
@@ -50,30 +53,37 @@ def write(
         output_file(path, force=force, inputs=(flight.path, *inputs)) as partial,
         FlightWriter(partial, force=True, clock_offsets_ns=flight.clock_offsets_ns) as writer,
     ):
-        copy_source(flight, writer)
+        seen = result.images
+        fixes = [] if seen is None or seen.fixes is None else series_of_batch(seen.fixes)
+        copy_source(flight, writer, attachments=(CONFIG_NAME,), cameras=seen.sensors if seen else ())
         writer.add_attachment(CONFIG_NAME, "application/toml", result.config_text.encode())
         writer.add_metadata(SOFTWARE, {"software": f"deckfix {__version__}", "engine": result.run.engine})
+        if seen is not None and seen.source == "images":
+            told = {k: str(v) for k, v in seen.block().items() if not isinstance(v, dict)}
+            writer.add_metadata(VISION, told | {f"no fix: {why}": str(n) for why, n in seen.no_fix.items()})
         utc_offset_ns = flight.clock_offsets_ns.get(AUTOPILOT, 0)
         series = estimate_series(result.run, utc_offset_ns, result.forecasts)
-        writer.write_series(*series, *smoothed_series(result.smoothed, utc_offset_ns))
+        writer.write_series(*fixes, *series, *smoothed_series(result.smoothed, utc_offset_ns))
 
 
-def copy_source(flight: Flight, writer: FlightWriter) -> None:
+def copy_source(
+    flight: Flight, writer: FlightWriter, *, attachments: Sequence[str] = (), cameras: Sequence[str] = ()
+) -> None:
     """Copy metadata, attachments and messages of a log, in the order of their arrival, without our own
-    topics.
+    topics, without the ``attachments`` and without the fixes of the ``cameras`` (sensors) that are replaced.
     """
-    from deckfix.replaying import CONFIG_NAME
     from logs.writer import CLOCKS
 
     for name, entries in flight.metadata.items():
-        if name not in (CLOCKS, SOFTWARE):
+        if name not in (CLOCKS, SOFTWARE) and not (cameras and name == VISION):
             writer.add_metadata(name, entries)
     for name, (media_type, data) in flight.attachments.items():
-        if name != CONFIG_NAME:
+        if name not in attachments:
             writer.add_attachment(name, media_type, data)
     channels: dict[int, int] = {}
     for info in flight.channels:
-        if info.count and not info.topic.startswith(OURS):
+        seen_by = info.metadata.get("sensor", "vision") if info.topic == "/vision/fix" else None
+        if info.count and not info.topic.startswith(OURS) and seen_by not in cameras:
             schema = (info.message_type, info.schema_encoding, info.schema) if info.message_type else None
             channels[info.id] = writer.open_channel(info.topic, info.message_encoding, schema, info.metadata)
     topics = {info.topic for info in flight.channels if info.id in channels}

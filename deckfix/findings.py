@@ -8,6 +8,7 @@ import numpy as np
 
 from deckfix.deck_findings import deck_findings
 from deckfix.finding import Finding, Severity
+from deckfix.image_findings import image_findings
 from deckfix.result import Result
 from estimation.events import Kind
 from estimation.outcome import EXPLANATIONS, Outcome
@@ -58,6 +59,7 @@ def findings(result: Result) -> list[Finding]:
         _problems,
         _notes,
         _inputs,
+        image_findings,
         _outcomes,
         _consistency,
         deck_findings,

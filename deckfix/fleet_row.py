@@ -63,7 +63,7 @@ def _replayed(task: RowTask) -> Row:
     config = None if task.config is None else parse_config(task.config)
     with tempfile.TemporaryDirectory(prefix="deckfix-") as scratch:
         flight, remarks = _opened(task.files, Path(scratch))
-        result = replay(flight, config, task.engine)
+        result = replay(flight, config, task.engine, jobs=1)
         row = row_of(result, remarks)
         if task.report is not None:
             task.report.parent.mkdir(parents=True, exist_ok=True)

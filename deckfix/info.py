@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from estimation.events import Kind
 if TYPE_CHECKING:
     from logs.channels import ChannelInfo
     from logs.reader import Flight
+    from vision.camera import Camera
+    from vision.target import RingTarget
 
 
 def describe(path: str | Path) -> str:
@@ -41,6 +44,7 @@ def describe(path: str | Path) -> str:
             gaps = _gaps(flight, topic) if len(infos) == 1 else ""
             kind = info.message_type or info.message_encoding
             lines.append(f"{topic:<28} {info.count:>9,} {shown:>9} {gaps:>5}  {kind} ({info.clock})")
+    lines += _camera(flight)
     offsets = flight.clock_offsets_ns
     if offsets:
         lines += ["", "clocks (constant that takes their stamps to UTC)"]
@@ -57,6 +61,45 @@ def describe(path: str | Path) -> str:
         *(["problems", *(f"  {p}" for p in flight.problems)] if flight.problems else ["no problems found"]),
     ]
     return "\n".join(printable(line) for line in lines)
+
+
+def _camera(flight: Flight) -> list[str]:
+    """Return lines on images, camera and target, where the log has any of them."""
+    from deckfix.files import InputError
+    from deckfix.log_images import camera_of, target_of
+    from logs.images import count, first_size
+
+    def told(made: Callable[[Flight], Any], words: Callable[[Any], str], absent: str) -> str:
+        try:
+            found = made(flight)
+        except InputError as error:
+            return f"cannot be used ({error})"
+        return absent if found is None else words(found)
+
+    frames = count(flight)
+    camera = told(camera_of, _camera_words, "none: its images cannot be looked at")
+    target = told(target_of, _target_words, "none: its images cannot be looked at")
+    lines = []
+    if frames:
+        size = first_size(flight)
+        shown = f"{size[0]} x {size[1]} pixels" if size else "the first cannot be decoded"
+        lines.append(f"  images: {frames:,}, {shown}")
+    for name, words in (("camera", camera), ("target", target)):
+        if frames or not words.startswith("none"):
+            lines.append(f"  {name}: {words}")
+    return ["", "camera", *lines] if lines else []
+
+
+def _camera_words(camera: Camera) -> str:
+    lens = "with lens distortion" if camera.distortion else "without lens distortion"
+    return (
+        f"{camera.width} x {camera.height} pixels, {np.degrees(camera.hfov_rad):.1f} deg wide, {lens}, "
+        f"read out in {camera.readout_s * 1e3:.1f} ms"
+    )
+
+
+def _target_words(target: RingTarget) -> str:
+    return f"{target.name or 'rings'}, {target.diameter_m:g} m across, {len(target.edges_m)} edges"
 
 
 def _rate_hz(info: ChannelInfo) -> float | None:

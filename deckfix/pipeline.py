@@ -52,6 +52,9 @@ PRIOR_SHARE = 0.1
 RATE_NS = 20_000_000
 """The body's rate is the mean of the inertial samples this close to the image."""
 
+UNDECODABLE = "the image cannot be decoded"
+"""The reason of an image that is damaged, or of a format that is not known."""
+
 
 class DetectorSettings(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
     """How images are looked at: arguments of ``vision.TargetDetector``.
@@ -125,9 +128,8 @@ class Pipeline:
     def __post_init__(self) -> None:
         """Build the estimator and the detector."""
         self.estimator = LandingEstimator(self.config, engine=self.engine, facts=self.facts)
-        v = self.config.vision
-        self._R_cb = R_CB_NOMINAL @ quat_to_matrix(euler_to_quat(*v.mount_rpy_rad)).T
-        self._lever_m = np.array(v.lever_arm_m)
+        self._R_cb = body_to_camera(self.config)
+        self._lever_m = np.array(self.config.vision.lever_arm_m)
         if self.camera is not None and self.target is not None:
             s = msgspec.structs.asdict(self.settings)
             self._detector = TargetDetector(self.camera, self.target, R_cb=self._R_cb, **s)
@@ -243,19 +245,37 @@ class Pipeline:
     def _look(self, image: bytes | Picture, time_ns: int | None) -> Fix | NoFix:
         if self._detector is None:
             return NoFix("no camera and target are configured")
-        picture = decode(image) if isinstance(image, bytes | bytearray | memoryview) else image
-        if picture is None:
-            return NoFix("the image cannot be decoded")
         rotation = self.attitude(time_ns)
         rate = None
         near = self._nearest(time_ns)
         if near is not None and time_ns is not None:
             rate = self._rate(time_ns, near.nominal)
-        try:
-            R_nc = None if rotation is None else rotation @ self._R_cb.T
-            return self._detector.detect(picture, R_nc, self.expected(time_ns), rate)
-        except ValueError as error:
-            return NoFix(str(error))
+        R_nc = None if rotation is None else rotation @ self._R_cb.T
+        return look_at(self._detector, image, R_nc, self.expected(time_ns), rate)
+
+
+def look_at(
+    detector: TargetDetector,
+    image: bytes | Picture,
+    R_nc: Array | None,
+    expected: Fix | Array | None = None,
+    rate_radps: Array | None = None,
+) -> Fix | NoFix:
+    """Return what a detector finds in an image, encoded or not; one that is no image of its camera has no fix."""
+    picture = decode(image) if isinstance(image, bytes | bytearray | memoryview) else image
+    if picture is None:
+        return NoFix(UNDECODABLE)
+    try:
+        return detector.detect(picture, R_nc, expected, rate_radps)
+    except ValueError as error:
+        return NoFix(str(error))
+
+
+def body_to_camera(config: Config) -> Array:
+    """Return the rotation (3, 3) of body to camera as it is mounted."""
+    mount = quat_to_matrix(euler_to_quat(*config.vision.mount_rpy_rad))
+    rotation: Array = R_CB_NOMINAL @ mount.T
+    return rotation
 
 
 def decode(data: bytes) -> Picture | None:

@@ -4,6 +4,7 @@ holds.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from deckfix.clock_track import clock_tracks
 from deckfix.deck_reference import compare_deck, raw_fixes
+from deckfix.log_images import images_told
 from deckfix.reference import (
     Column,
     Times,
@@ -57,13 +59,18 @@ def replay(
     engine: EngineName = "auto",
     *,
     smooth: bool = False,
+    images: bool | None = None,
+    jobs: int | None = None,
 ) -> Result:
     """Run the estimator over a log and return what came out.
 
     ``config`` is a configuration or the path of one; without it the log's own is used, or else the default. With
-    ``smooth`` the result has the smoothed estimates too (docs/smoothing.md).
-    Raises ``logs.errors.LogError`` where the log cannot be read or holds no inertial samples, and
-    ``estimation.config.ConfigError`` for a configuration or an engine that cannot be used.
+    ``smooth`` the result has the smoothed estimates too (docs/smoothing.md). ``images`` says whether the log's images
+    are looked at, in ``jobs`` processes (None: one a core): True always, False never, None where the log holds no
+    vision fixes (docs/video.md).
+    Raises ``logs.errors.LogError`` where the log cannot be read or holds no inertial samples,
+    ``deckfix.files.InputError`` for images that cannot be looked at, and ``estimation.config.ConfigError`` for a
+    configuration or an engine that cannot be used.
     """
     opened = open(flight) if isinstance(flight, str | Path) else flight
     settings, source = configuration(opened, config)
@@ -75,11 +82,16 @@ def replay(
         raise LogError(
             opened.path, "holds no inertial samples (/imu)", "log the IMU, or import the file that has it"
         )
+    known = facts(opened)
+    seen = images_told(opened, batch, settings, known, engine, wanted=images, jobs=jobs)
+    if seen is not None and seen.fixes is not None:
+        batch, known = seen.replace_in(batch), dataclasses.replace(known, vision_by_arrival=False)
     begin = time.perf_counter()
-    estimator = LandingEstimator(settings, engine=engine, facts=facts(opened), smooth=smooth)
+    estimator = LandingEstimator(settings, engine=engine, facts=known, smooth=smooth)
     run = estimator.run(batch)
     wall_s = time.perf_counter() - begin
-    result = present(opened, run, batch, settings, source, wall_s)
+    result = present(opened, run, batch, settings, source, wall_s, known)
+    result.images = seen
     if smooth:
         take_smoothed(result, estimator.smoothed(run))
     return result
@@ -121,11 +133,11 @@ def _stated(flight: Flight, topic: str, key: str) -> float | None:
 
 
 def present(
-    flight: Flight, run: Run, batch: EventBatch, config: Config, source: str, wall_s: float = 0.0
+    flight: Flight, run: Run, batch: EventBatch, config: Config, source: str, wall_s: float, known: Facts
 ) -> Result:
     """Return the result of a run over a log's events, compared with the references in the log."""
     text = dump_config(config)
-    config = with_facts(config, facts(flight))
+    config = with_facts(config, known)
     imu = batch.rows["stamp_ns"][batch.rows["kind"] == int(Kind.IMU)]
     start_ns, end_ns = int(imu.min()), int(imu.max())
     offsets = flight.clock_offsets_ns

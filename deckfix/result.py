@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import plotly.graph_objects as go
 
+    from deckfix.log_images import ImagesTold
     from estimation.heave.model import HeaveModel
     from estimation.output import Run
     from logs.reader import Flight
@@ -79,7 +80,8 @@ class Result:
     autopilot's; both are None where the log holds no such reference, as ``deck_errors`` is. ``platform`` is the
     platform's truth, ``fixes`` what each vision fix says by itself, ``clock_tracks`` every other clock over time,
     ``vision_latency_s`` the configured age of a fix. ``smoothed`` has the smoothed estimates in ``run``'s columns, with
-    their own errors, where they were asked for. ``source`` is the log it came from, for ``write``.
+    their own errors, where they were asked for. ``images`` tells what became of the log's images. ``source`` is the log
+    it came from, for ``write``.
     """
 
     flight: str
@@ -108,6 +110,7 @@ class Result:
     messages: tuple[LogMessage, ...] = ()
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     vibration_mps2: float | None = None
+    images: ImagesTold | None = None
     source: Flight | None = None
 
     @cached_property
@@ -240,6 +243,8 @@ class Result:
                 if (s := self.nis(n)) is not None
             },
         }
+        if self.images is not None:
+            out["vision"] = self.images.block()
         if self.truth_errors is not None:
             out["truth"] = {"odometry": rmse_block(self.truth_errors, self.judged)}
             if self.deck_errors is not None:

@@ -68,6 +68,12 @@ def import_files(paths: Sequence[str | Path], system: int | None = None) -> Reco
     return out
 
 
+def is_mcap(path: Path) -> bool:
+    """Tell whether a file is a log as deckfix writes it, or another MCAP file."""
+    with path.open("rb") as file:
+        return file.read(len(_MCAP)) == _MCAP
+
+
 def recognise(path: Path) -> str:
     """Return what kind of log a file is, by its content.
 

@@ -234,7 +234,7 @@ def test_ctrl_c_leaves_no_half_file(tmp_path: Path, log: Path) -> None:
     code = (
         "import signal, sys, deckfix.estimate_log as e\nfrom deckfix.cli import main\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a shell's background job\n"
-        "def wait(flight, writer):\n    print('writing', flush=True)\n    import time; time.sleep(60)\n"
+        "def wait(*_, **__):\n    print('writing', flush=True)\n    import time; time.sleep(60)\n"
         "e.copy_source = wait\n"
         f"sys.exit(main(['replay', {str(log)!r}, '-o', {str(out)!r}, '--engine', 'filterpy']))"
     )

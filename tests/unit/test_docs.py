@@ -34,7 +34,7 @@ def test_configurations_shown_are_valid(page: Path) -> None:
 
 def test_options_shown_exist() -> None:
     text = "".join(p.read_text(encoding="utf-8") for p in PAGES)
-    known = {o for c in program.commands.values() for p in c.params for o in p.opts}
+    known = {o for c in program.commands.values() for p in c.params for o in (*p.opts, *p.secondary_opts)}
     known |= {"--help", "--version"}
     for line in re.findall(r"^ {4}.*deckfix [a-z]+ .*$", text, re.M):
         for option in re.findall(r"--[a-z-]+", line.split("#")[0]):

@@ -235,7 +235,7 @@ def test_columns_do_not_depend_on_the_order_of_rows() -> None:
 
 def test_an_unexpected_error_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = small_log(tmp_path / "x.mcap", 2.0)
-    monkeypatch.setattr("deckfix.replaying.replay", lambda *_: 1 / 0)
+    monkeypatch.setattr("deckfix.replaying.replay", lambda *_, **__: 1 / 0)
     row = make_row(RowTask(FlightFiles("x.mcap", (log,)), None, "filterpy", None))
     assert row["status"] == "error"
     assert "ZeroDivisionError" in row["error"]
