@@ -142,7 +142,7 @@ def info(file: str) -> None:
 @click.option(
     "--images/--no-images",
     default=None,
-    help="Look at the log's images for fixes; never.  [default: where the log holds no vision fixes]",
+    help="Look at the log's images for fixes; never.  [default: where the log holds no fixes]",
 )
 @_JOBS
 @_FORCE

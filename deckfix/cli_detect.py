@@ -40,13 +40,13 @@ def detect(
     Where there is no fix the reason is printed; that is no error. The exit code is 1 if a file cannot be
     read.
     """
-    from deckfix.files import check_output, output_file
+    from deckfix.files import check_output, loaded, output_file
     from vision import RingTarget
 
     places = _overlay_paths(files, overlay)
     for place in [*places.values(), *([json_path] if json_path not in (None, "-") else [])]:
         check_output(str(place), force=force, inputs=files)
-    target = _loaded(RingTarget, target_path) if target_path is not None else RingTarget.recommended()
+    target = loaded(RingTarget, target_path) if target_path is not None else RingTarget.recommended()
     rows: list[dict[str, Any]] = []
     failures: list[str] = []
     for name in files:
@@ -87,7 +87,7 @@ def _one(
 
     import numpy as np
 
-    from deckfix.files import InputError, existing
+    from deckfix.files import InputError, existing, loaded
     from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_to_matrix
     from vision import Camera, TargetDetector
     from vision.overlay import draw_overlay
@@ -97,7 +97,7 @@ def _one(
         raise InputError(f"{name}: not a picture that can be decoded; give PNG or JPEG")
     height, width = image.shape[:2]
     if camera_path is not None:
-        camera = _loaded(Camera, camera_path)
+        camera = loaded(Camera, camera_path)
     else:
         camera = Camera.from_fov(width, height, math.radians(62.2))
     rotation = None
@@ -188,15 +188,3 @@ def _save(picture: Any, place: Path, inputs: tuple[str, ...], force: bool) -> No
     with output_file(place, force=force, inputs=inputs) as partial:
         encoded = cv2.imencode(place.suffix, picture)[1]
         partial.write_bytes(encoded.tobytes())
-
-
-def _loaded(kind: Any, path: str) -> Any:
-    """Return ``kind.load(path)`` with its error as one for the user."""
-    from deckfix.files import InputError, existing
-
-    try:
-        return kind.load(existing(path))
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(str(error)) from error

@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 class OutputError(ValueError):
@@ -28,6 +29,16 @@ def existing(path: str | Path) -> Path:
     if not os.access(given, os.R_OK):
         raise InputError(f"{path}: cannot be read; check its permissions")
     return given
+
+
+def loaded(kind: Any, path: str | Path) -> Any:
+    """Return ``kind.load(path)`` (a camera, a target) with its error as ``InputError``."""
+    try:
+        return kind.load(existing(path))
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(str(error)) from error
 
 
 def check_output(path: str | Path, *, force: bool, inputs: Sequence[str | Path] = ()) -> Path:

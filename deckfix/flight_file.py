@@ -18,8 +18,9 @@ from typing import Annotated, Any
 
 import msgspec
 
-from deckfix.files import InputError, existing
+from deckfix.files import InputError, loaded
 from deckfix.pipeline import DetectorSettings
+from deckfix.video_import import CAMERA_NAME, TARGET_NAME
 from estimation.config import Config, ConfigError, dump_config, load_config
 from simulation.flight import config_of
 from vision.camera import Camera
@@ -57,9 +58,9 @@ class FlightFile:
         """Return what a log of the flight carries along: configuration, camera and target as TOML."""
         texts = {"config.toml": dump_config(self.config)}
         if self.camera is not None:
-            texts["camera.toml"] = self.camera.to_toml()
+            texts[CAMERA_NAME] = self.camera.to_toml()
         if self.target is not None:
-            texts["target.toml"] = self.target.to_toml()
+            texts[TARGET_NAME] = self.target.to_toml()
         return {name: ("application/toml", text.encode()) for name, text in texts.items()}
 
 
@@ -105,13 +106,3 @@ def _parsed(path: Path) -> tuple[Config, OnboardTable]:
 
 def _beside(folder: Path, name: str | None) -> Path | None:
     return None if name is None else folder / name
-
-
-def loaded(kind: Any, path: str | Path) -> Any:
-    """Return ``kind.load(path)`` (a camera, a target) with its error as one for the user."""
-    try:
-        return kind.load(existing(path))
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(str(error)) from error

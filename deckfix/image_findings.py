@@ -17,16 +17,14 @@ def image_findings(result: Result) -> Iterator[Finding]:
     if told is None:
         return
     if told.source == "none":
-        asked = told.why == "not asked for"
+        lacking = told.lacking
         yield Finding(
-            Severity.NOTE if asked else Severity.WARNING,
+            Severity.WARNING if lacking else Severity.NOTE,
             told.sentence(),
-            "they were left out on request"
-            if asked
-            else "what a frame shows needs the camera and the target's size",
-            "leave --no-images out"
-            if asked
-            else "add them: deckfix import F.mcap --camera C.toml --target T.toml -o G.mcap",
+            "what a frame shows needs the camera and the target's size" if lacking else "they were left out",
+            "add them: deckfix import F.mcap --camera C.toml --target T.toml -o G.mcap"
+            if lacking
+            else "nothing; --images looks at them",
         )
         return
     if told.source == "recorded":

@@ -58,7 +58,8 @@ VISION_ENGINES = {"auto": "auto", "compiled": "compiled", "filterpy": "numpy"}
 class ImagesTold:
     """What became of a log's images.
 
-    ``source`` of the fixes: ``images``, ``recorded`` (fixes that the log holds) or ``none``, with ``why``. ``frames``
+    ``source`` of the fixes: ``images``, ``recorded`` (fixes that the log holds) or ``none``, with ``why`` (``lacking``:
+    they could not be looked at). ``frames``
     were in the log, ``undecodable`` of them damaged; ``no_fix`` counts the reasons. ``fixes`` are the events, in the
     order of arrival; ``sensors`` are the names of those sensors whose recorded fixes they replace.
     """
@@ -70,6 +71,7 @@ class ImagesTold:
     fixes: EventBatch | None = None
     sensors: tuple[str, ...] = ()
     why: str = ""
+    lacking: bool = False
 
     def block(self) -> dict[str, object]:
         """Return the summary's ``vision``."""
@@ -136,8 +138,9 @@ def images_told(
 ) -> ImagesTold | None:
     """Return what a log's images show, or None where it has none and none are ``wanted``.
 
-    ``wanted`` True looks at them even where the log holds the fixes already, False never does, None where there are no
-    fixes. Raises ``InputError`` where they are wanted and cannot be looked at, or camera or target are damaged.
+    ``wanted`` True looks at them even where the log holds the fixes already, False never does, None where it holds
+    neither fixes nor estimates (whoever made these had the images).
+    Raises ``InputError`` where they are wanted and cannot be looked at, or camera or target are damaged.
     """
     frames = count_images(flight)
     if not frames and not wanted:
@@ -145,6 +148,8 @@ def images_told(
     recorded = bool(np.any(batch.rows["kind"] == int(Kind.VISION)))
     if wanted is False or (wanted is None and recorded):
         return ImagesTold("recorded" if recorded else "none", frames, why="" if recorded else "not asked for")
+    if wanted is None and "/estimate/odometry" in flight.topics:
+        return ImagesTold("none", frames, why="the log holds estimates without fixes (--images does)")
     camera, target = camera_of(flight), target_of(flight)
     missing = [n for n, v in (("images", frames), ("camera", camera), ("target", target)) if not v]
     if missing and wanted:
@@ -153,7 +158,7 @@ def images_told(
             "--video V --camera C.toml --target T.toml -o G.mcap"
         )
     if camera is None or target is None:
-        return ImagesTold("none", frames, why=f"the log holds no {' and no '.join(missing)}")
+        return ImagesTold("none", frames, why=f"the log holds no {' and no '.join(missing)}", lacking=True)
     R_cb = body_to_camera(config)
     sights = list(_sights(flight, batch, config, known, engine))
     how = (camera, target, DetectorSettings(), R_cb, VISION_ENGINES[engine])

@@ -66,8 +66,8 @@ def replay(
 
     ``config`` is a configuration or the path of one; without it the log's own is used, or else the default. With
     ``smooth`` the result has the smoothed estimates too (docs/smoothing.md). ``images`` says whether the log's images
-    are looked at, in ``jobs`` processes (None: one a core): True always, False never, None where the log holds no
-    vision fixes (docs/video.md).
+    are looked at, in ``jobs`` processes (None: one a core): True always, False never, None where the log holds
+    neither vision fixes nor estimates (docs/video.md).
     Raises ``logs.errors.LogError`` where the log cannot be read or holds no inertial samples,
     ``deckfix.files.InputError`` for images that cannot be looked at, and ``estimation.config.ConfigError`` for a
     configuration or an engine that cannot be used.

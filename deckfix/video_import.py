@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from deckfix.files import InputError, existing
+from deckfix.files import InputError, existing, loaded
 
 if TYPE_CHECKING:
     from logs.video import Frame, FrameTimes
@@ -54,8 +54,8 @@ class Extras:
             None if video is None else _recording(video),
             None if stamps is None else existing(stamps),
             None if offset_s is None else _nanoseconds(offset_s),
-            None if camera is None else _loaded(Camera, camera),
-            None if target is None else _loaded(RingTarget, target),
+            None if camera is None else loaded(Camera, camera),
+            None if target is None else loaded(RingTarget, target),
         )
 
     @property
@@ -150,12 +150,3 @@ def _nanoseconds(text: str) -> int:
         return int(Decimal(text) * 1_000_000_000)
     except (InvalidOperation, ValueError, OverflowError):
         raise InputError(f"--offset: {text!r} is no number of seconds; give one, for example -52.3") from None
-
-
-def _loaded(kind: Any, path: str) -> Any:
-    try:
-        return kind.load(existing(path))
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(str(error)) from error

@@ -111,11 +111,15 @@ def test_fixes_are_replaced_where_images_are_asked_for(result: Result, tmp_path:
     assert first.read_bytes() == (tmp_path / "second.mcap").read_bytes()
 
 
-def test_images_are_left_alone_where_that_is_asked_for(log: Path) -> None:
+def test_images_are_left_alone_where_that_is_asked_for(log: Path, tmp_path: Path) -> None:
     without = deckfix.replay(log, images=False)
     assert without.summary()["vision"] == {"source": "none", "frames": COUNT, "reason": "not asked for"}
     assert not without.has_deck
     assert any("not looked at" in f.symptom for f in findings(without))
+    without.write(tmp_path / "out.mcap")
+    again = deckfix.replay(tmp_path / "out.mcap")
+    assert again.summary()["vision"]["source"] == "none"
+    assert np.array_equal(again.run.nominal, without.run.nominal)
 
 
 def test_without_a_camera_the_images_are_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
