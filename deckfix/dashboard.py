@@ -40,6 +40,8 @@ def rows(status: Status) -> list[tuple[str, str]]:
         )
     out.append(("rates", ", ".join(f"{n} {r:.0f}/s" for n, r in sorted(status.rates_hz.items())) or "-"))
     out.append(("latency", _latency(status)))
+    if status.log:
+        out.append(("log", status.log))
     out.append(("drops", _counted(status.drops)))
     out.append(("turned away", _counted(status.turned_away)))
     return out
@@ -55,6 +57,8 @@ def line(status: Status) -> str:
     parts.append(f"latency {_latency(status)}")
     if status.drops:
         parts.append(f"drops {_counted(status.drops)}")
+    if any(name.startswith("log ") for name in status.drops):
+        parts.append(status.log)
     return printable(" | ".join(parts))
 
 

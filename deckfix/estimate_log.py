@@ -30,6 +30,7 @@ OURS = ("/estimate/", "/smoothed/", "/fusion", "/heave/")
 """Topics that a replay writes; those of an earlier replay are not copied."""
 VISION = "deckfix.vision"
 """Metadata record that tells what the images showed that the fixes in a log come from."""
+_DAY_NS = 86_400_000_000_000
 SOFTWARE = "deckfix.estimate"
 """Metadata record that tells what made the estimates."""
 
@@ -103,7 +104,8 @@ def estimate_series(run: Run, utc_offset_ns: int, made: Forecasts) -> list[Serie
     series of fusion records a sensor.
 
     Fusion records are stamped with the time of their content and logged at their arrival; ``utc_offset_ns``
-    takes the inertial clock to UTC.
+    takes the inertial clock to UTC. Where the content's time is not known on that clock yet (a fix before the clocks
+    were compared) the arrival stands for it.
     """
     from logs.estimates import fusion_series, state_series
 
@@ -115,10 +117,15 @@ def estimate_series(run: Run, utc_offset_ns: int, made: Forecasts) -> list[Serie
     out.extend(_heave_series(run, utc_offset_ns, made))
     for index in np.unique(run.records["sensor"]):
         r = run.records[run.records["sensor"] == index]
+        t_ns = np.where(
+            np.abs(r["t_ns"] + utc_offset_ns - r["arrival_ns"]) < _DAY_NS,
+            r["t_ns"],
+            r["arrival_ns"] - utc_offset_ns,
+        )
         told = (r["outcome"].astype(np.uint8), r["nis"], r["dof"].astype(np.uint8))
         name = run.sensors[int(index)]
         rest = (r["innovation"], r["sigma"], r["age_s"])
-        out.append(fusion_series(name, r["t_ns"], r["arrival_ns"], *told, *rest))
+        out.append(fusion_series(name, t_ns, r["arrival_ns"], *told, *rest))
     return out
 
 

@@ -69,6 +69,7 @@ class Status:
     rates_hz: dict[str, float]
     drops: dict[str, int]
     turned_away: dict[str, int]
+    log: str
     mode: str
     armed: bool
     link_alive: bool
@@ -368,6 +369,7 @@ class Onboard:
             "" if self.guide is None else self.guide.words, self._clocks,
             (float(np.median(taken)), float(np.percentile(taken, 95))) if taken else (np.nan, np.nan),
             dict(self._rates), dict(drops),
-            {**self.link.counts, **self.link.sensors.counts_turned_away}, vehicle.mode_name, vehicle.armed,
-            self.link.alive,
+            {**self.link.counts, **self.link.sensors.counts_turned_away},
+            "" if self.recorder is None else self.recorder.failed or str(self.recorder.path),
+            vehicle.mode_name, vehicle.armed, self.link.alive,
         )  # fmt: skip

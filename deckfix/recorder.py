@@ -163,20 +163,27 @@ class Recorder:
             steps = [self._steps.popleft() for _ in range(len(self._steps))]
             for _ in range(len(self._images)):
                 self._write_image(writer, self._images.popleft())
-            series = self._sensors(steps)
-            if series:
-                # The first message of a clock fixes its constant, which the estimates of that clock need.
-                writer.write_series(*series)
+            # The first message of a clock fixes its constant, which the estimates of that clock need.
+            self._put(writer, self._sensors(steps), "sensors")
             offset = writer.clock_offsets_ns.get(AUTOPILOT)
             if offset is not None:
                 run = run_of(steps, self.estimator)
-                writer.write_series(*estimate_series(run, offset, forecasts([])))
-                writer.write_series(*self._decided())
-            writer.write_series(*self._said())
+                self._put(writer, estimate_series(run, offset, forecasts([])), "estimates")
+                self._put(writer, self._decided(), "decisions")
+            self._put(writer, self._said(), "texts")
             writer.flush()
             self.written += len(steps)
         except LogError as error:
             self.failed = str(error)
+
+    def _put(self, writer: FlightWriter, series: list[Series], what: str) -> None:
+        """Write series; those that cannot be stored are counted and left out, a disk's error is passed on."""
+        try:
+            writer.write_series(*series)
+        except LogError as error:
+            if isinstance(error.__cause__, OSError):
+                raise
+            self.drops[what] += sum(len(s) for s in series)
 
     def _sensors(self, steps: list[Step]) -> list[Series]:
         events = [s.event for s in steps if s.event is not None]

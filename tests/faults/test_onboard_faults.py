@@ -198,10 +198,11 @@ def test_a_killed_process_loses_a_second_at_most(folder: Path, tmp_path: Path) -
     with ScriptedAutopilot(port) as autopilot:
         run = Process(folder, port, log)
         wait(lambda: len(autopilot.heard("LANDING_TARGET")) > 10, run.process)
-        run.end(signal.SIGKILL)
+        said = run.end(signal.SIGKILL)
         told_ns = autopilot.heard("LANDING_TARGET")[-1].time_usec * 1000
     flight = open_flight(log)
     assert not flight.complete
+    assert "/imu" in flight.topics, said
     (imu,) = flight.series("/imu")
     assert told_ns - int(imu.arrival_ns[-1]) < 1_000_000_000
     compared = compare_recorded(replay(flight, engine="filterpy"), flight)

@@ -10,11 +10,13 @@ import pytest
 from small_flight import small_events
 
 from deckfix import recorder as module
+from deckfix.check import compare_recorded
 from deckfix.files import OutputError
 from deckfix.intake import MOST_EVENTS, CompanionClock, Intake
 from deckfix.pipeline import ImageEvent, Pipeline
 from deckfix.recorder import Recorder, log_path
-from estimation.events import COMPANION, Imu
+from deckfix.replaying import replay
+from estimation.events import COMPANION, Imu, VisionFix
 from logs import open_flight
 from logs.errors import LogError
 from logs.writer import FlightWriter
@@ -81,7 +83,7 @@ def test_a_full_disk_is_said_and_the_flight_goes_on(tmp_path: Path, monkeypatch:
     made, pipeline = begun(tmp_path / "f.mcap")
 
     def full(self: FlightWriter, *series: object) -> None:
-        raise LogError(self.path, "cannot be written (No space left on device)", "free space")
+        raise LogError(self.path, "cannot be written (No space left on device)", "free space") from OSError()
 
     monkeypatch.setattr(FlightWriter, "write_series", full)
     monkeypatch.setattr(module, "PERIOD_S", 0.02)
@@ -118,3 +120,32 @@ def test_the_queue_is_bounded_and_keeps_the_newest_image() -> None:
     assert isinstance(first, ImageEvent)
     assert isinstance(first.image, np.ndarray)
     assert first.image.shape[0] == 10
+
+
+def test_a_fix_before_the_clocks_were_compared_is_recorded_and_replays(tmp_path: Path) -> None:
+    made, pipeline = begun(tmp_path / "f.mcap")
+    events = small_events(2.0)
+    first = events[0].arrival_ns
+    early = VisionFix(first, first, (0.0, 0.0, 5.0), None, clock=COMPANION)
+    for event in (*events[:1], early, *events[1:]):
+        made.step(pipeline.step(event))
+    made.step(pipeline.finish())
+    made.close()
+    assert made.failed == ""
+    assert made.drops.total() == 0
+    log = open_flight(tmp_path / "f.mcap")
+    assert len(log.series("/vision/fix")[0]) == 1
+    compared = compare_recorded(replay(log, engine="filterpy"), log)
+    assert compared is not None
+    assert compared[0] == []
+
+
+def test_what_cannot_be_stored_is_left_out_and_the_rest_is_written(tmp_path: Path) -> None:
+    made, pipeline = begun(tmp_path / "f.mcap")
+    events = small_events(1.0)
+    made.step(pipeline.step(events[0]))
+    made.say(-5, 20, "from before 1970")
+    made.close()
+    assert made.failed == ""
+    assert made.drops["texts"] == 1
+    assert len(open_flight(tmp_path / "f.mcap").events()) == 1
