@@ -35,8 +35,8 @@ _REMEDIES: dict[Outcome, tuple[str, str]] = {
         "check the time synchronisation of its clock, and the inertial gaps",
     ),
     Outcome.REJECTED_DUPLICATE: (
-        "the source repeats its last measurement",
-        "nothing to do: repeats are not counted twice",
+        "the source repeats its last measurement; a camera that does so for long has a picture that stands still",
+        "nothing to do about single ones: repeats are not counted twice; look at a camera that repeats itself",
     ),
     Outcome.REJECTED_NOT_READY: (
         "the filter was not initialised, the sensor had no valid reading, or it is switched off",
@@ -214,6 +214,7 @@ def _inputs(result: Result) -> Iterator[Finding]:
 
 
 def _outcomes(result: Result) -> Iterator[Finding]:
+    cameras = {s.name for s in result.streams if s.kind is Kind.VISION}
     for sensor in result.measured:
         if sensor in result.unused:
             continue
@@ -221,7 +222,7 @@ def _outcomes(result: Result) -> Iterator[Finding]:
         total = len(records)
         for outcome, (cause, remedy) in _REMEDIES.items():
             n = int(np.count_nonzero(records["outcome"] == int(outcome)))
-            harmless = outcome is Outcome.REJECTED_DUPLICATE
+            harmless = outcome is Outcome.REJECTED_DUPLICATE and sensor not in cameras
             if n < 3 or n / total < (0.05 if harmless else 0.01):
                 continue
             severity = Severity.NOTE if harmless else Severity.WARNING

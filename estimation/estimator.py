@@ -213,8 +213,8 @@ class LandingEstimator:
             return
         self._advance()
         self._ledger.keep(h.settle(everything=True))
-        rest = h.rows.take(np.arange(h.size))
-        rest.outcome[:] = Outcome.REJECTED_FUTURE
+        rest = h.first(h.size)
+        rest.outcome[rest.outcome != Outcome.REJECTED_DUPLICATE] = Outcome.REJECTED_FUTURE
         self._ledger.keep(rest)
         h.drop(h.size)
 
@@ -510,7 +510,7 @@ class LandingEstimator:
 
     def _not_ready(self, count: int) -> None:
         """Forget the first rows of the history, which came before the filter was ready."""
-        rows = self._history.rows.take(np.arange(count))
+        rows = self._history.first(count)
         rows.outcome[:] = np.where(rows.kind == Kind.IMU, Outcome.FUSED, Outcome.REJECTED_NOT_READY)
         self._ledger.reject(rows)
         self._history.drop(count)

@@ -13,11 +13,14 @@ from typing import Protocol
 
 import numpy as np
 
+from estimation.outcome import Outcome
 from estimation.rows import Estimates, FilterState, Int, Rows
 from estimation.tape import Tape
 from estimation.trail import Trail
 
-IMU = 0
+IMU, VISION = 0, 8
+REPEATED = 16
+"""Added to the kind of a row that repeats another under a new stamp: no kind that an engine would take."""
 CHECKPOINT_NS = 20_000_000
 """Spacing of the checkpoints: what a rewind runs again beyond the event's own age, at most."""
 
@@ -60,6 +63,9 @@ class History:
     checkpoints: list[tuple[int, FilterState]] = field(default_factory=list)
     tape: Tape | None = None
 
+    shown: dict[int, bytes] = field(default_factory=dict)
+    """Of each camera the place in the last fix that was forgotten."""
+
     def insert(self, new: Rows) -> Int:
         """Put events where they belong; return the ids of exact repetitions, which are left out."""
         n = len(new)
@@ -71,6 +77,7 @@ class History:
             self._reserve(place + 1)
             self.rows.write(place, new)
             self.size = place + 1
+            self._mark_repeated(place)
             return np.empty(0, dtype=np.int64)
         if place and self.rows.t_ns[place - 1] >= first:
             place = int(np.searchsorted(self.rows.t_ns[:place], first, side="left"))
@@ -86,6 +93,7 @@ class History:
         self._reserve(place + len(order))
         self.rows.write(place, merged.take(order))
         self.size = place + len(order)
+        self._mark_repeated(place)
         if first_changed < self.done:
             # Measurements between two inertial samples were taken with an interpolation between them, which an
             # insertion may change: all since the sample before is done again.
@@ -152,19 +160,48 @@ class History:
             del self.checkpoints[:keep]
         if cut <= 0:
             return Rows.empty(0)
-        settled = self.rows.take(np.arange(cut))
+        settled = self.first(cut)
         if self.tape is not None:
             self.tape.keep(settled, None if everything else self.checkpoints[0][1])
         self.drop(cut)
         return settled
 
+    def first(self, count: int) -> Rows:
+        """Return the first ``count`` rows, as they are to be told of."""
+        rows = self.rows.take(np.arange(count))
+        repeated = rows.kind >= REPEATED
+        rows.outcome[repeated] = Outcome.REJECTED_DUPLICATE
+        rows.kind[repeated] -= REPEATED
+        return rows
+
     def drop(self, count: int) -> None:
         """Forget the first ``count`` rows."""
+        for i in np.flatnonzero(self.rows.kind[:count] % REPEATED == VISION):
+            self.shown[int(self.rows.sensor[i])] = self.rows.value[i, :3].tobytes()
         rest = self.rows.take(np.arange(count, self.size))
         self.rows.write(0, rest)
         self.size -= count
         self.done = max(0, self.done - count)
         self.checkpoints = [(i - count, s) for i, s in self.checkpoints]
+
+    def _mark_repeated(self, start: int) -> None:
+        """Mark, from row ``start`` on, the fixes that show to the last bit what their camera's fix before them shows.
+
+        A picture that stands still, or a detector that does, says nothing new: it must not count as a confirmation. The
+        mark depends on the order of the content alone, as all does.
+        """
+        kinds = self.rows.kind
+        for i in range(start, self.size):
+            if kinds[i] % REPEATED != VISION:
+                continue
+            sensor = int(self.rows.sensor[i])
+            before = i - 1
+            while before >= 0 and not (
+                kinds[before] % REPEATED == VISION and self.rows.sensor[before] == sensor
+            ):
+                before -= 1
+            shown = self.rows.value[before, :3].tobytes() if before >= 0 else self.shown.get(sensor)
+            kinds[i] = VISION + REPEATED * (shown == self.rows.value[i, :3].tobytes())
 
     def _reserve(self, n: int) -> None:
         capacity = len(self.rows)
@@ -176,10 +213,11 @@ class History:
 
 def _order(rows: Rows) -> Int:
     """Return the order by time, kind, sensor, value, covariance and last by arrival."""
-    order = np.lexsort((rows.kind, rows.t_ns))
-    t, k = rows.t_ns[order], rows.kind[order]
+    kind = rows.kind % REPEATED
+    order = np.lexsort((kind, rows.t_ns))
+    t, k = rows.t_ns[order], kind[order]
     if np.any((t[1:] == t[:-1]) & (k[1:] == k[:-1])):
-        keys = [rows.id, *rows.own.T[::-1], *rows.value.T[::-1], rows.sensor, rows.kind, rows.t_ns]
+        keys = [rows.id, *rows.own.T[::-1], *rows.value.T[::-1], rows.sensor, kind, rows.t_ns]
         order = np.lexsort(keys)
     return order.astype(np.int64)
 
@@ -187,7 +225,7 @@ def _order(rows: Rows) -> Int:
 def _repetitions(rows: Rows, order: Int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Return, in that order, which rows repeat the one before them in all but the order of arrival."""
     repeated = np.zeros(len(order), dtype=bool)
-    t, k = rows.t_ns[order], rows.kind[order]
+    t, k = rows.t_ns[order], rows.kind[order] % REPEATED
     for i in np.flatnonzero((t[1:] == t[:-1]) & (k[1:] == k[:-1])):
         a, b = int(order[i]), int(order[i + 1])
         repeated[i + 1] = (

@@ -27,7 +27,8 @@ class Outcome(IntEnum):
     REJECTED_FUTURE = 7
     """Further ahead of the inertial clock than the window allows."""
     REJECTED_DUPLICATE = 8
-    """Same sensor, same stamp and same content as one that was already taken."""
+    """Same sensor, same stamp and same content as one that was already taken; or a vision fix that shows to the last
+    bit what the one before it shows, under a new stamp (a picture that stands still)."""
     REJECTED_NOT_READY = 9
     """The filter is not initialised, the sensor says that it has no valid reading, or it is switched off."""
 

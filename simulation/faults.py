@@ -112,20 +112,35 @@ def delayed(
 ) -> EventBatch:
     """Let the readings of a sensor arrive later, their stamps as they were."""
     rows = batch.rows.copy()
-    rows["arrival_ns"][_of(batch, sensor, start_s, duration_s)] += round(by_s * 1e9)
-    return _with(batch, rows[np.argsort(rows["arrival_ns"], kind="stable")])
+    hit = _of(batch, sensor, start_s, duration_s)
+    rows["arrival_ns"][hit] += round(by_s * 1e9)
+    when = _arrivals_ns(batch) + np.where(hit, round(by_s * 1e9), 0)
+    return _with(batch, rows[np.argsort(when, kind="stable")])
 
 
 def repeated(batch: EventBatch, sensor: str, start_s: float, duration_s: float = FOREVER_S) -> EventBatch:
     """Deliver readings twice, the second time 50 ms later."""
-    copies = batch.rows[_of(batch, sensor, start_s, duration_s)].copy()
+    hit = _of(batch, sensor, start_s, duration_s)
+    copies = batch.rows[hit].copy()
     copies["arrival_ns"] += 50_000_000
-    rows = np.concatenate([batch.rows, copies])
-    return _with(batch, rows[np.argsort(rows["arrival_ns"], kind="stable")])
+    when = _arrivals_ns(batch)
+    order = np.argsort(np.concatenate([when, when[hit] + 50_000_000]), kind="stable")
+    return _with(batch, np.concatenate([batch.rows, copies])[order])
+
+
+def _arrivals_ns(batch: EventBatch) -> NDArray[np.int64]:
+    """Return when each event arrived. An exchange of times says its middle on its own clock instead: it arrived with
+    the event before it.
+    """
+    arrival: NDArray[np.int64] = batch.rows["arrival_ns"].copy()
+    exchange = batch.rows["kind"] == Kind.TIMESYNC
+    arrival[exchange] = arrival[~exchange].min()
+    result: NDArray[np.int64] = np.maximum.accumulate(arrival)
+    return np.where(exchange, result, arrival)
 
 
 def _seconds(batch: EventBatch) -> NDArray[np.float64]:
-    arrival = batch.rows["arrival_ns"]
+    arrival = _arrivals_ns(batch)
     since: NDArray[np.float64] = (arrival - arrival.min()) * 1e-9
     return since
 

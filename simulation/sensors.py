@@ -170,7 +170,18 @@ class Sensors:
             batches.append(self._timesync(trajectory, s.timesync, exchanging))
         if s.vision is not None:
             batches.append(self._vision(trajectory, s.vision, seeing, slow))
-        return Drawn(EventBatch.concatenate(batches), slow)
+        return Drawn(self._as_they_arrive(EventBatch.concatenate(batches)), slow)
+
+    def _as_they_arrive(self, batch: EventBatch) -> EventBatch:
+        """Return the events in the order of arrival. An exchange says the companion's time instead, of its middle."""
+        rows = batch.rows
+        when = rows["arrival_ns"].copy()
+        exchange = rows["kind"] == Kind.TIMESYNC
+        answered = when[exchange] + rows["value"][exchange, 1].astype(np.int64)
+        true_s = self.clocks.get(COMPANION, Clock()).true_s(answered)
+        when[exchange] = self.place.utc_ns + np.round(true_s * 1e9).astype(np.int64)
+        order = np.argsort(when, kind="stable")
+        return EventBatch(rows[order], batch.sensors, batch.clocks, batch.timesync_reference)
 
     def _imu(
         self, trajectory: Trajectory, stream: Stream, rng: np.random.Generator, slow: dict[str, SlowError]
