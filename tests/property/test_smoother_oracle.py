@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from estimation import parameters as par
 from estimation.config import parse_config
+from estimation.deck import MOTION_SIZE
 from estimation.events import Kind
 from estimation.frames import geodetic_to_ned
 from estimation.history import Engine
@@ -84,7 +85,7 @@ def test_a_point_mass_is_smoothed_as_by_filterpy(name: str) -> None:
         imu,
         np.zeros(3),
         np.zeros((64, MEMORY_SIZE)),
-        np.r_[0.1, 1.0, 1.0, 1.0, [0.5] * 3],
+        np.zeros(MOTION_SIZE),
     )
     rows = point_mass_flight(p)
     engine = start(name, p, layout, state)
@@ -154,7 +155,7 @@ def test_steps_back_are_filterpys_for_any_linear_model(seed: int) -> None:
     for i in range(m):
         Fs[i], Qs[i] = np.eye(k) + 0.1 * rng.normal(size=(k, k)), 0.1 * _covariance(rng, k)
         x, P = Fs[i] @ x, Fs[i] @ P @ Fs[i].T + Qs[i]
-        trail.open(i, nominal(x), widened(P), np.zeros(7))
+        trail.open(i, nominal(x), widened(P), np.zeros(MOTION_SIZE))
         trail.chain[i] = np.eye(n)
         trail.chain[i][np.ix_(free, free)] = scale[:, None] * Fs[i] / scale
         H = rng.normal(size=(3, k))
