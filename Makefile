@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PYTEST_ARGS ?= -n 2
 BENCHMARKS := $(shell grep -l __main__ benchmarks/*.py)
 
-.PHONY: help demo test nightly lint format bench clean core dev
+.PHONY: help demo test nightly lint format bench docs clean core dev
 
 help:
 	@echo "make demo     simulate a landing, replay it, write demo/report.html"
@@ -13,6 +13,7 @@ help:
 	@echo "make lint     ruff, mypy, import contract"
 	@echo "make bench    run the benchmarks (real recordings: set DECKFIX_DATA)"
 	@echo "make nightly  run the slow statistics"
+	@echo "make docs     build the documentation into site/, links checked"
 
 demo: core
 	$(BIN)/deckfix demo -o demo --force
@@ -36,8 +37,13 @@ format: dev
 bench: dev
 	@status=0; for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script || status=1; done; exit $$status
 
+docs: dev
+	$(BIN)/python docs/reference.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "open site/index.html"
+
 clean:
-	rm -rf $(VENV) demo build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) site demo build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The environment: made where it is missing, made anew where it belongs to another folder or Python, brought up
