@@ -23,7 +23,7 @@ from deckfix.replaying import replay
 from estimation.frames import R_CB_NOMINAL
 from logs import open_flight
 from simulation.renderer import Renderer
-from vision import Camera, RingTarget
+from vision import Camera, RingTarget, TargetDetector
 
 CAMERA = Camera.preset("rpi-v2-640x480")
 TARGET = RingTarget.recommended()
@@ -31,7 +31,10 @@ TARGET = RingTarget.recommended()
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a flight's files, and a video of three seconds over the target."""
+    """Return a folder with a flight's files, and a video of three seconds over the target.
+
+    What is compiled of the detector is compiled here, so that no process has to do it while it is waited for.
+    """
     path = tmp_path_factory.mktemp("onboard")
     (path / "camera.toml").write_text(CAMERA.to_toml())
     (path / "target.toml").write_text(TARGET.to_toml())
@@ -45,6 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for _ in range(35):
         video.write(image)
     video.release()
+    TargetDetector(CAMERA, TARGET).detect(image)
     return path
 
 
@@ -164,7 +168,7 @@ class Process:
         return said
 
 
-def wait(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 60.0) -> None:
+def wait(condition: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 120.0) -> None:
     until = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.communicate()[0]
