@@ -21,6 +21,7 @@ from deckfix.cli_detect import detect
 from deckfix.cli_heave import heave
 from deckfix.cli_onboard import onboard
 from deckfix.cli_sync import sync
+from deckfix.cli_tune import tune
 from deckfix.cli_vision import calibrate, target
 
 # The matrices here are small: threads of the linear algebra library only wait for each other. It reads this when
@@ -59,6 +60,7 @@ _ORDER = (
     "target",
     "calibrate",
     "sync",
+    "tune",
     "fleet",
 )
 
@@ -320,6 +322,7 @@ deckfix.add_command(target)
 deckfix.add_command(calibrate)
 deckfix.add_command(heave)
 deckfix.add_command(sync)
+deckfix.add_command(tune)
 
 
 def _say(text: str) -> None:

@@ -141,10 +141,10 @@ def present(
     imu = batch.rows["stamp_ns"][batch.rows["kind"] == int(Kind.IMU)]
     start_ns, end_ns = int(imu.min()), int(imu.max())
     offsets = flight.clock_offsets_ns
-    truth = _trajectory(flight, "/truth/odometry", offsets)
-    platform = _trajectory(flight, "/truth/platform", offsets)
+    truth = trajectory(flight, "/truth/odometry", offsets)
+    platform = trajectory(flight, "/truth/platform", offsets)
     contact = contact_time_ns(truth, platform) if truth is not None else None
-    autopilot = _trajectory(flight, "/autopilot/odometry", offsets)
+    autopilot = trajectory(flight, "/autopilot/odometry", offsets)
     result = Result(
         flight=Path(flight.path).name,
         run=run,
@@ -240,7 +240,7 @@ def at_reference(run: Run, autopilot: Trajectory, truth: Trajectory, judged: Win
     )
 
 
-def _trajectory(flight: Flight, topic: str, offsets: dict[str, int]) -> Trajectory | None:
+def trajectory(flight: Flight, topic: str, offsets: dict[str, int]) -> Trajectory | None:
     """Return a reference on the inertial clock: of its sources the densest for each quantity."""
     series = [s for s in flight.series(topic) if len(s)] if topic in flight.topics else []
     times = [_on_inertial_clock(s, offsets) for s in series]

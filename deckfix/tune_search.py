@@ -1,0 +1,197 @@
+"""The search for the best parameters, and what it says of how well they are known.
+
+All in the logarithms of the parameters. A first sweep takes one parameter after the other to the best of a few factors,
+since far from the truth the likelihood can be flat (a noise below what the receiver states has no effect). SciPy's
+L-BFGS-B goes on from there within the bounds, each parameter in units of its own curvature, with differences of the
+objective as derivatives. At the end the Hessian H by central differences gives a Newton step, where that is better, and
+the covariance H^-1 of the logarithms (Bar-Shalom, Li and Kirubarajan, 2001, section 2.4).
+
+A weak prior (a factor of ``PRIOR`` is one sigma about the start) belongs to the objective: it decides nothing that the
+flights tell of, and keeps what they say nothing of.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.frames import Array
+
+PRIOR = 30.0
+SWEEP = (1.0 / 10.0, 1.0 / math.sqrt(10.0), math.sqrt(10.0), 10.0)
+STEP = 0.05
+"""Step of the derivatives: smaller ones see how single measurements pass the gate, or do not."""
+LEAST_STEP, LARGEST_STEP = 0.02, 0.3
+"""Steps of the Hessian: about one sigma, within these."""
+AT_BOUND = 0.01
+ITERATIONS = 40
+KNOWN = math.log(3.0) / 1.96
+"""A parameter is identified where its 95 % interval is within a factor of three of it."""
+
+Objective = Callable[[Sequence[Array]], list[float]]
+"""Minus log-likelihood at points of log-parameters, the prior left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Where a search ended: log-parameters (p,), the objective there with its prior, and evaluations used."""
+
+    point: Array
+    value: float
+    evaluations: int
+
+
+@dataclass(frozen=True, slots=True)
+class Certainty:
+    """How well log-parameters are known: 1-sigma (p,), infinite where the objective is not curved; ``at_bound`` (p,)
+    those that lie on a bound, where no sigma means anything."""
+
+    sigma: Array
+    at_bound: NDArray[np.bool_]
+
+    @property
+    def identified(self) -> NDArray[np.bool_]:
+        """Which parameters the flights tell of."""
+        known: NDArray[np.bool_] = (self.sigma < KNOWN) & ~self.at_bound
+        return known
+
+
+@dataclass(slots=True)
+class Search:
+    """Searches of one objective within bounds (p,), about the prior's centre (p,)."""
+
+    objective: Objective
+    lower: Array
+    upper: Array
+    centre: Array
+    evaluations: int = 0
+
+    def values(self, points: Sequence[Array]) -> Array:
+        """Return the objective with its prior at points within the bounds."""
+        self.evaluations += len(points)
+        prior = [0.5 * float(np.sum((p - self.centre) ** 2)) / math.log(PRIOR) ** 2 for p in points]
+        out: Array = np.array(self.objective(points)) + np.array(prior)
+        return out
+
+    def run(self, start: Array, sweep: bool = True) -> Found:
+        """Return where the search from a start ends."""
+        from scipy.optimize import minimize
+
+        before = self.evaluations
+        point = np.clip(start, self.lower, self.upper)
+        value = float(self.values([point])[0])
+        if sweep:
+            point, value = self._swept(point, value)
+        _, curvature = self._derivatives(point, value, np.full(len(point), STEP))
+        unit = 1.0 / np.sqrt(np.clip(curvature, 1.0, 1e6))
+        best = Found(point, value, 0)
+
+        def scaled(y: Array) -> tuple[float, Array]:
+            nonlocal best
+            x = np.clip(y * unit, self.lower, self.upper)
+            steps = np.where(x + STEP <= self.upper, STEP, -STEP)
+            all_values = self.values([x, *(x + s * e for s, e in zip(steps, np.eye(len(x)), strict=True))])
+            if all_values[0] < best.value:
+                best = Found(x, float(all_values[0]), 0)
+            return float(all_values[0]), (all_values[1:] - all_values[0]) / steps * unit
+
+        minimize(
+            scaled,
+            point / unit,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=list(zip(self.lower / unit, self.upper / unit, strict=True)),
+            options={"maxiter": ITERATIONS, "ftol": 1e-7, "gtol": 0.05, "maxls": 10},
+        )
+        return Found(best.point, best.value, self.evaluations - before)
+
+    def certainty(self, found: Found) -> tuple[Found, Certainty]:
+        """Return what a Newton step from the end of a search gives, where it is better, and how certain it is."""
+        x, n = found.point, len(found.point)
+        at_bound = (x - self.lower < AT_BOUND) | (self.upper - x < AT_BOUND)
+        free = np.flatnonzero(~at_bound)
+        sigma = np.full(n, np.inf)
+        if not len(free):
+            return found, Certainty(sigma, at_bound)
+        room = np.minimum(x - self.lower, self.upper - x)
+        _, curvature = self._derivatives(x, found.value, np.minimum(STEP, room), free)
+        wanted = np.clip(1.0 / np.sqrt(np.maximum(curvature, 1e-9)), LEAST_STEP, LARGEST_STEP)
+        steps = np.minimum(wanted, room)
+        H, gradient = self._hessian(x, found.value, steps, free)
+        shift = np.zeros(n)
+        try:
+            np.linalg.cholesky(H)
+            sigma[free] = np.sqrt(np.diag(np.linalg.inv(H)))
+            shift[free] = -np.linalg.solve(H, gradient)
+        except np.linalg.LinAlgError:
+            # Not a minimum in every direction: what is known is what is curved by itself and with the rest that is.
+            sigma[free] = _partly(H)
+        y = np.clip(x + np.clip(shift, -0.5, 0.5), self.lower, self.upper)
+        value = float(self.values([y])[0])
+        better = Found(y, value, self.evaluations) if value < found.value else found
+        return better, Certainty(sigma, at_bound)
+
+    def _swept(self, point: Array, value: float) -> tuple[Array, float]:
+        for k in range(len(point)):
+            tried = []
+            for factor in SWEEP:
+                other = point.copy()
+                other[k] = np.clip(point[k] + math.log(factor), self.lower[k], self.upper[k])
+                tried.append(other)
+            values = self.values(tried)
+            best = int(np.argmin(values))
+            if values[best] < value:
+                point, value = tried[best], float(values[best])
+        return point, value
+
+    def _derivatives(
+        self, x: Array, value: float, steps: Array, which: NDArray[np.int64] | None = None
+    ) -> tuple[Array, Array]:
+        """Return first and second derivatives (p,) by central differences, 0 where not asked for."""
+        chosen = np.arange(len(x)) if which is None else which
+        inner = np.clip(x, self.lower + steps, self.upper - steps)
+        points = [_moved(inner, k, s * steps[k]) for k in chosen for s in (1.0, -1.0)]
+        values = self.values(points).reshape(-1, 2)
+        first, second = np.zeros(len(x)), np.zeros(len(x))
+        h = steps[chosen]
+        first[chosen] = (values[:, 0] - values[:, 1]) / (2.0 * h)
+        second[chosen] = (values[:, 0] - 2.0 * value + values[:, 1]) / h**2
+        return first, second
+
+    def _hessian(self, x: Array, value: float, steps: Array, free: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return the Hessian (f, f) and gradient (f,) by the f free parameters."""
+        f = len(free)
+        h = steps[free]
+        single = [_moved(x, k, s * steps[k]) for k in free for s in (1.0, -1.0)]
+        pairs = [(a, b) for a in range(f) for b in range(a)]
+        double = [_moved(_moved(x, free[a], h[a]), free[b], h[b]) for a, b in pairs]
+        values = self.values([*single, *double])
+        one, two = values[: 2 * f].reshape(f, 2), values[2 * f :]
+        H = np.diag((one[:, 0] - 2.0 * value + one[:, 1]) / h**2)
+        for (a, b), both in zip(pairs, two, strict=True):
+            H[a, b] = H[b, a] = (both - one[a, 0] - one[b, 0] + value) / (h[a] * h[b])
+        return H, (one[:, 0] - one[:, 1]) / (2.0 * h)
+
+
+def _moved(x: Array, k: int | np.int64, by: float) -> Array:
+    y = x.copy()
+    y[k] += by
+    return y
+
+
+def _partly(H: Array) -> Array:
+    """Return sigmas (f,) from the largest set of parameters whose Hessian is positive, infinite for the others."""
+    kept = list(np.argsort(-np.diag(H)))
+    while kept:
+        part = H[np.ix_(kept, kept)]
+        if np.linalg.eigvalsh(part)[0] > 0.0:
+            break
+        kept.pop()
+    sigma = np.full(len(H), np.inf)
+    if kept:
+        sigma[kept] = np.sqrt(np.diag(np.linalg.inv(H[np.ix_(kept, kept)])))
+    return sigma
