@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PYTEST_ARGS ?= -n 2
-BENCHMARKS := $(shell grep -l __main__ benchmarks/*.py)
+BENCH_ARGS ?=
 
 .PHONY: help demo test nightly lint format bench docs clean core dev
 
@@ -11,7 +11,8 @@ help:
 	@echo "make demo     simulate a landing, replay it, write demo/report.html"
 	@echo "make test     run the tests"
 	@echo "make lint     ruff, mypy, import contract"
-	@echo "make bench    run the benchmarks (real recordings: set DECKFIX_DATA)"
+	@echo "make bench    run the benchmarks in minutes, against their baselines (real recordings: set DECKFIX_DATA;"
+	@echo "              BENCH_ARGS=--full for all flights and repetitions, BENCH_ARGS='--only fleet tune' for some)"
 	@echo "make nightly  run the slow statistics"
 	@echo "make docs     build the documentation into site/, links checked"
 
@@ -35,7 +36,7 @@ format: dev
 	$(BIN)/ruff format .
 
 bench: dev
-	@status=0; for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script || status=1; done; exit $$status
+	$(BIN)/python benchmarks/run.py $(BENCH_ARGS)
 
 docs: dev
 	$(BIN)/python docs/reference.py

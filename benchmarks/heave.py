@@ -22,6 +22,7 @@ import heave_methods as methods
 import numpy as np
 from heave_series import HORIZONS_S, SIMULATED, Observation, find_data, real_windows, simulated_windows
 from numpy.typing import NDArray
+from targets import Target, Targets, provenance
 
 from estimation import heave
 
@@ -134,25 +135,23 @@ def show(cell: Cell) -> dict[str, Any]:
     }
 
 
-def targets(real: Cell) -> None:
-    """Print the targets on real seas and what was reached."""
+def targets(real: Cell) -> Targets:
+    """Return the targets on real seas and what was reached."""
     ratio = real.rmse("learned") / real.rmse("optimal")
     versus = real.rmse("learned") / real.rmse("mean")
     nees = real.nees.mean(axis=0)
-    print("\ntargets on real seas")
+    out = Targets()
     for at, wanted in TARGET_RATIO.items():
         k = int(np.flatnonzero(at == HORIZONS_S)[0])
-        verdict = "met" if ratio[k] <= wanted else "MISSED"
-        print(f"  ratio at {at:3.1f} s <= {wanted:.2f}: {ratio[k]:.3f} {verdict}")
+        out.add(Target(f"real seas: RMSE over the optimal at {at:g} s", float(ratio[k]), wanted))
     low, high = TARGET_NEES
-    inside = bool(np.all((nees >= low) & (nees <= high)))
-    print(
-        f"  worst against the mean <= {TARGET_MEAN}: {versus.max():.3f} {'met' if versus.max() <= 1.05 else 'MISSED'}"
-    )
-    print(f"  NEES in {low} .. {high}: {nees.min():.2f} .. {nees.max():.2f} {'met' if inside else 'MISSED'}")
+    out.add(Target("real seas: RMSE over the mean predictor, worst", float(versus.max()), TARGET_MEAN))
+    out.add(Target("real seas: NEES, least", float(nees.min()), low, at_least=True))
+    out.add(Target("real seas: NEES, largest", float(nees.max()), high))
+    return out
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
     parser.add_argument("--windows", type=int, default=12, help="windows per real half-hour")
     parser.add_argument("--trials", type=int, default=20, help="trials per simulated sea")
@@ -161,7 +160,13 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     began = time.perf_counter()
-    out: dict[str, Any] = {"horizon_s": HORIZONS_S.tolist(), "span_s": arguments.span, "cells": {}}
+    out: dict[str, Any] = {
+        "benchmark": "heave",
+        **provenance(),
+        "horizon_s": HORIZONS_S.tolist(),
+        "span_s": arguments.span,
+        "cells": {},
+    }
     folder = find_data()
     real = None
     if folder is None:
@@ -177,12 +182,14 @@ def main() -> None:
         out["cells"][name] = show(cells[-1])
     together = pooled(cells)
     out["cells"][together.name] = show(together)
-    if real is not None:
-        targets(real)
+    judged = Targets() if real is None else targets(real)
+    good = judged.report()
+    out["targets"] = judged.as_rows()
     print(f"\n{time.perf_counter() - began:.0f} s")
     if arguments.json:
         arguments.json.write_text(json.dumps(out, indent=1) + "\n")
+    return 0 if good else 1
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import tempfile
 import time
@@ -20,6 +19,8 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+from targets import Target, Targets, provenance
 
 from logs.dataflash import read_dataflash
 from logs.importer import import_files
@@ -106,23 +107,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = [measure(f, options.trials) for f in files]
     print(f"{'file':14} {'MB':>6} {'messages':>9} {'DFReader s':>11} {'decode s':>9} {'import s':>9} "
           f"{'decode x (min..max)':>22} {'import/DFReader':>17}")  # fmt: skip
-    good = True
+    targets = Targets()
     for row in rows:
         low, middle, high = row["decode_speedup"]
         share = row["import_over_pymavlink"][1]
         print(f"{row['file']:14} {row['megabytes']:6.1f} {row['messages']:9d} {row['pymavlink_s']:11.3f} "
               f"{row['decode_s']:9.3f} {row['import_s']:9.3f} {middle:8.1f} ({low:.1f}..{high:.1f}) "
               f"{share:12.3f}")  # fmt: skip
-        good &= middle >= DECODE_TARGET and share <= IMPORT_TARGET
-    print(
-        f"targets: decode >= {DECODE_TARGET:g}x, import <= {IMPORT_TARGET:g}: {'met' if good else 'MISSED'}"
-    )
+        name = f"{row['file']}: decoding, DFReader over ours"
+        targets.add(Target(name, middle, DECODE_TARGET, at_least=True, spread=high - low))
+        first, _, last = row["import_over_pymavlink"]
+        targets.add(Target(f"{row['file']}: import over DFReader", share, IMPORT_TARGET, spread=last - first))
+    good = targets.report()
     if options.json:
         report = {
-            "date": time.strftime("%Y-%m-%d", time.gmtime()),
-            "python": platform.python_version(),
+            "benchmark": "import_speed",
+            **provenance(),
             "pymavlink": version("pymavlink"),
             "files": rows,
+            "targets": targets.as_rows(),
         }
         options.json.write_text(json.dumps(report, indent=1) + "\n")
     return 0 if good else 1

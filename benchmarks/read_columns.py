@@ -20,12 +20,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import tempfile
 import time
 from collections.abc import Callable
-from datetime import UTC as UTC_ZONE
-from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -34,6 +31,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
+from targets import Target, Targets, provenance
 
 from estimation.events import Imu
 from logs import FlightWriter, Series, open_flight
@@ -161,7 +159,7 @@ def live(folder: Path, count: int = 4000) -> float:
         return (time.process_time() - start) / count * 1e6
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -177,10 +175,10 @@ def main() -> None:
         bulk = write_ours(ours, series, arguments.duration, rng)
         rewrite_mixed(ours, mixed)
         results: dict[str, Any] = {
-            "date": datetime.now(UTC_ZONE).date().isoformat(),
+            "benchmark": "read_columns",
+            **provenance(),
             "duration_s": arguments.duration,
             "rounds": arguments.rounds,
-            "python": platform.python_version(),
             "mcap": version("mcap"),
             "mcap_ros2_support": version("mcap-ros2-support"),
             "bulk_write_us_per_message": round(bulk / sum(map(len, series)) * 1e6, 2),
@@ -206,11 +204,19 @@ def main() -> None:
             text = f"{r['median']:.1f} ({r['min']:.1f} - {r['max']:.1f})"
             print(f"{text:>25}", end="")
         print()
+    targets = Targets()
+    for way, bound in (("iterate", 3.0), ("decode", 20.0)):
+        r = results["files"]["ours"][f"{way}_over_columns"]
+        spread = r["max"] - r["min"]
+        targets.add(Target(f"columns: {way} over ours", r["median"], bound, at_least=True, spread=spread))
     print(f"bulk write {results['bulk_write_us_per_message']:.2f} us a message,", end=" ")
     print(f"live event {results['live_event_us']:.1f} us")
+    good = targets.report()
+    results["targets"] = targets.as_rows()
     if arguments.json:
         arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+    return 0 if good else 1
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -1,8 +1,14 @@
-"""What the benchmarks on real flights share: targets, consistency of a run, and where the numbers come from."""
+"""What the benchmarks share: targets, baselines, consistency of a run, and where the numbers come from.
+
+A baseline is what a benchmark wrote with ``--json`` once, committed in ``benchmarks/baselines``. A number of it is
+missed where it has become worse by more than its spread: the one that the benchmark gave with it (over its
+repetitions), or else ``TOLERANCE`` of the baseline.
+"""
 
 from __future__ import annotations
 
 import datetime
+import json
 import platform
 import subprocess
 from dataclasses import dataclass, field
@@ -15,15 +21,19 @@ from numpy.typing import NDArray
 from deckfix.result import nis_band
 from estimation.output import Run
 
+BASELINES = Path(__file__).parent / "baselines"
+TOLERANCE = 0.1
+
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A number and its bound: at most, or with ``at_least`` at least, the bound."""
+    """A number and its bound: at most, or with ``at_least`` at least, the bound; ``spread`` over the repetitions."""
 
     name: str
     value: float | None
     bound: float
     at_least: bool = False
+    spread: float | None = None
 
     @property
     def met(self) -> bool:
@@ -53,7 +63,46 @@ class Targets:
 
     def as_rows(self) -> list[dict[str, Any]]:
         """Return the targets as they are written to JSON."""
-        return [{"name": t.name, "value": t.value, "bound": t.bound, "met": t.met} for t in self.all]
+        return [
+            {
+                "name": t.name,
+                "value": t.value,
+                "bound": t.bound,
+                "at_least": t.at_least,
+                "spread": t.spread,
+                "met": t.met,
+            }
+            for t in self.all
+        ]
+
+
+def missed_baselines(found: dict[str, Any], baseline: dict[str, Any]) -> list[str]:
+    """Return a line for each number of a baseline that is missed by more than its spread, or is not there any more."""
+    now = {t["name"]: t for t in found["targets"]}
+    out = []
+    for then in baseline["targets"]:
+        name, old = then["name"], then["value"]
+        if old is None:
+            continue
+        new = now[name]["value"] if name in now else None
+        if new is None:
+            out.append(f"{name}: was {old:.6g}, and is not measured any more")
+            continue
+        spread = then.get("spread")
+        allowed = TOLERANCE * abs(old) if spread is None else spread
+        worse = old - new if then.get("at_least") else new - old
+        if worse > allowed + 1e-12:
+            out.append(f"{name}: was {old:.6g}, is {new:.6g}; a spread of {allowed:.3g} is allowed")
+    return out
+
+
+def load_baseline(name: str) -> dict[str, Any] | None:
+    """Return the committed baseline of a benchmark, or None where there is none with targets."""
+    path = BASELINES / f"{name}.json"
+    if not path.is_file():
+        return None
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found if found.get("targets") else None
 
 
 def nis_row(records: NDArray[np.void]) -> dict[str, Any]:
