@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,7 @@ from estimation.output import Facts, Run, with_facts
 from estimation.state import CAMERA_LATENCY, NOMINAL
 
 if TYPE_CHECKING:
+    from estimation.filter import Model
     from logs.reader import Flight
     from logs.recording import Series
 
@@ -61,16 +63,19 @@ def replay(
     smooth: bool = False,
     images: bool | None = None,
     jobs: int | None = None,
+    sensors: Mapping[str, tuple[Model, float]] | None = None,
 ) -> Result:
     """Run the estimator over a log and return what came out.
 
     ``config`` is a configuration or the path of one; without it the log's own is used, or else the default. With
     ``smooth`` the result has the smoothed estimates too (docs/smoothing.md). ``images`` says whether the log's images
     are looked at, in ``jobs`` processes (None: one a core): True always, False never, None where the log holds
-    neither vision fixes nor estimates (docs/video.md).
+    neither vision fixes nor estimates (docs/video.md). ``sensors`` are those of the user's on /user, by name: each with
+    its model and its latency [s], for ``LandingEstimator.add_sensor`` (docs/add-a-sensor.md); they need the reference
+    engine, which ``auto`` then is.
     Raises ``logs.errors.LogError`` where the log cannot be read or holds no inertial samples,
-    ``deckfix.files.InputError`` for images that cannot be looked at, and ``estimation.config.ConfigError`` for a
-    configuration or an engine that cannot be used.
+    ``deckfix.files.InputError`` for images that cannot be looked at and for sensors that the log lacks, and
+    ``estimation.config.ConfigError`` for a configuration or an engine that cannot be used.
     """
     opened = open(flight) if isinstance(flight, str | Path) else flight
     settings, source = configuration(opened, config)
@@ -82,12 +87,21 @@ def replay(
         raise LogError(
             opened.path, "holds no inertial samples (/imu)", "log the IMU, or import the file that has it"
         )
+    for name in sensors or {}:
+        if name not in batch.sensors:
+            from deckfix.files import InputError
+
+            told = f"{opened.path}: holds no measurements of the sensor {name!r}"
+            raise InputError(f"{told}; write them to /user, or give the name that they have there")
     known = facts(opened)
     seen = images_told(opened, batch, settings, known, engine, wanted=images, jobs=jobs)
     if seen is not None and seen.fixes is not None:
         batch, known = seen.replace_in(batch), dataclasses.replace(known, vision_by_arrival=False)
     begin = time.perf_counter()
-    estimator = LandingEstimator(settings, engine=engine, facts=known, smooth=smooth)
+    chosen: EngineName = "filterpy" if sensors and engine == "auto" else engine
+    estimator = LandingEstimator(settings, engine=chosen, facts=known, smooth=smooth)
+    for name, (model, latency_s) in (sensors or {}).items():
+        estimator.add_sensor(name, model, latency_s)
     run = estimator.run(batch)
     wall_s = time.perf_counter() - begin
     result = present(opened, run, batch, settings, source, wall_s, known)
