@@ -141,12 +141,13 @@ def run_tune(
         chosen = tuple((p.name, v) for p, v in zip(parameters, values, strict=True))
         trials = [replays.trial(str(Path(f).resolve()), chosen) for f in (*tuned_on, *held_out)]
         after = dict(zip((*tuned_on, *held_out), replays.scores(trials), strict=True))
-    flights = []
+    flights, names = [], [Path(f).name for f in (*tuned_on, *held_out)]
     for f in (*tuned_on, *held_out):
         start, end = before[f], after[f]
         if isinstance(start, Refused) or isinstance(end, Refused):
             raise InputError(f"{f}: could be replayed at first, and then no more; was it changed meanwhile?")
-        flights.append(TunedFlight(Path(f).name, hashes[f], f in held_out, start, end))
+        name = Path(f).name if names.count(Path(f).name) == 1 else f
+        flights.append(TunedFlight(name, hashes[f], f in held_out, start, end))
     command = _command(files, holdouts, output, options)
     tuned = Tuned(parameters, values, certainty, flights, command, source, replays_done, options.truth_weight)
     written = tuned.better

@@ -2,9 +2,9 @@
 
 All in the logarithms of the parameters. A first sweep takes one parameter after the other to the best of a few factors,
 since far from the truth the likelihood can be flat (a noise below what the receiver states has no effect). SciPy's
-L-BFGS-B goes on from there within the bounds, each parameter in units of its own curvature, with differences of the
-objective as derivatives. At the end the Hessian H by central differences gives a Newton step, where that is better, and
-the covariance H^-1 of the logarithms (Bar-Shalom, Li and Kirubarajan, 2001, section 2.4).
+L-BFGS-B goes on from there within the bounds, with differences of the objective as derivatives, each parameter in units
+of its own curvature, which is taken anew on the way. At the end the Hessian H by central differences gives a Newton
+step, where that is better, and the covariance H^-1 of the logarithms (Bar-Shalom, Li and Kirubarajan, 2001, 2.4).
 
 A weak prior (a factor of ``PRIOR`` is one sigma about the start) belongs to the objective: it decides nothing that the
 flights tell of, and keeps what they say nothing of.
@@ -28,7 +28,8 @@ STEP = 0.05
 LEAST_STEP, LARGEST_STEP = 0.02, 0.3
 """Steps of the Hessian: about one sigma, within these."""
 AT_BOUND = 0.01
-ITERATIONS = 40
+ITERATIONS, LEGS, WORTH = 12, 6, 0.5
+"""Iterations of L-BFGS-B between which curvatures are taken anew, how often, and the gain below which it ends."""
 KNOWN = math.log(3.0) / 1.96
 """A parameter is identified where its 95 % interval is within a factor of three of it."""
 
@@ -79,16 +80,26 @@ class Search:
 
     def run(self, start: Array, sweep: bool = True) -> Found:
         """Return where the search from a start ends."""
-        from scipy.optimize import minimize
-
         before = self.evaluations
         point = np.clip(start, self.lower, self.upper)
         value = float(self.values([point])[0])
         if sweep:
             point, value = self._swept(point, value)
-        _, curvature = self._derivatives(point, value, np.full(len(point), STEP))
-        unit = 1.0 / np.sqrt(np.clip(curvature, 1.0, 1e6))
         best = Found(point, value, 0)
+        for _ in range(LEGS):
+            leg = self._leg(best)
+            gained, best = best.value - leg.value, leg
+            if gained < WORTH:
+                break
+        return Found(best.point, best.value, self.evaluations - before)
+
+    def _leg(self, start: Found) -> Found:
+        """Return where some iterations of L-BFGS-B lead to, each parameter in units of its curvature at the start."""
+        from scipy.optimize import minimize
+
+        best, steps = start, np.full(len(start.point), STEP)
+        _, curvature = self._derivatives(start.point, start.value, steps)
+        unit = 1.0 / np.sqrt(np.clip(curvature, 1.0, 1e6))
 
         def scaled(y: Array) -> tuple[float, Array]:
             nonlocal best
@@ -101,13 +112,13 @@ class Search:
 
         minimize(
             scaled,
-            point / unit,
+            start.point / unit,
             jac=True,
             method="L-BFGS-B",
             bounds=list(zip(self.lower / unit, self.upper / unit, strict=True)),
             options={"maxiter": ITERATIONS, "ftol": 1e-7, "gtol": 0.05, "maxls": 10},
         )
-        return Found(best.point, best.value, self.evaluations - before)
+        return best
 
     def certainty(self, found: Found) -> tuple[Found, Certainty]:
         """Return what a Newton step from the end of a search gives, where it is better, and how certain it is."""

@@ -120,6 +120,29 @@ def test_an_interrupted_tuning_goes_on_where_it_was(
     assert a == b
 
 
+def test_the_workers_of_a_cluster_find_the_same(flights: list[str], tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="dask is not installed")
+    here, there = tmp_path / "here.toml", tmp_path / "there.toml"
+    options = dataclasses.replace(OPTIONS, parameters=TWO[:1])
+    run_tune(flights[:2], [], here, options)
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        run_tune(flights[:2], [], there, dataclasses.replace(options, scheduler=cluster.scheduler_address))
+    assert here.read_text().splitlines()[1:] == there.read_text().splitlines()[1:]
+
+
+def test_an_unreachable_scheduler_is_one_line(
+    flights: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed", reason="dask is not installed")
+    monkeypatch.setattr("deckfix.parallel.CONNECT_S", 1)
+    command = ["tune", flights[0], "-o", str(tmp_path / "c.toml"), "--scheduler", "tcp://127.0.0.1:9"]
+    assert main(command) == 1
+    err = capsys.readouterr().err.splitlines()
+    assert err[-1].startswith("deckfix: tcp://127.0.0.1:9: no Dask scheduler answers")
+
+
 def test_the_state_of_another_tuning_is_not_overwritten(flights: list[str], tmp_path: Path) -> None:
     (tmp_path / f"c.toml{STATE}").write_text("mine\n")
     with pytest.raises(OutputError, match="is left from another tuning"):
