@@ -154,7 +154,7 @@ def run_tune(
     if written:
         config = parse_config(dump_config(with_values(base, chosen)), "the tuned configuration")
         write_text(target, provenance(tuned) + dump_config(config), force=options.force)
-        replays.state.unlink(missing_ok=True)
+    replays.state.unlink(missing_ok=True)
     lines = [*remarks, report(tuned)]
     lines.append(f"wrote {target}" if written else f"{target}: not written: {tuned.verdict}")
     return "\n".join(printable(line) for text in lines for line in text.split("\n")), written
