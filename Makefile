@@ -8,7 +8,7 @@ BENCH_ARGS ?=
 .PHONY: help demo test nightly lint format bench docs clean core dev
 
 help:
-	@echo "make demo     simulate a landing, replay it, write demo/report.html"
+	@echo "make demo     fly a landing on rendered pictures, replay it, write demo/report.html"
 	@echo "make test     run the tests"
 	@echo "make lint     ruff, mypy, import contract"
 	@echo "make bench    run the benchmarks in minutes, against their baselines (real recordings: set DECKFIX_DATA;"

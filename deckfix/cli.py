@@ -310,7 +310,10 @@ def doctor() -> None:
 @click.option("--seed", default=1, show_default=True, help="Of the simulated flight.")
 @_FORCE
 def demo(output: str, seed: int, force: bool) -> None:
-    """Simulate a flight, replay it and write the report; needs no data."""
+    """Fly a landing on rendered pictures, replay its log, write the report.
+
+    The whole loop, search to touchdown on a raft in Beaufort 2, in a minute or so; needs no data.
+    """
     from deckfix.demo import run_demo
 
     _say(run_demo(output, seed=seed, force=force))

@@ -1,4 +1,8 @@
-"""The commands ``simulate`` and ``demo``: a flight from nothing but a scenario and a seed."""
+"""The commands ``simulate`` and ``demo``: a flight from nothing but a scenario and a seed.
+
+The demo is the whole loop: a landing flown from the search to the deck on what the pipeline sees in rendered pictures,
+its log, the replay of that, and the report.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +16,9 @@ from estimation.config import ConfigError
 
 if TYPE_CHECKING:
     from logs.recording import Recording
+    from simulation.world import Flown
 
-DEMO_SCENARIO = "landing_2026_06"
+DEMO_MISSION = "landing_beaufort2_2026_11"
 
 
 def simulate_flight(
@@ -54,25 +59,43 @@ def _simulated(scenario: str, seed: int | None) -> tuple[Recording, str]:
     from simulation.world import fly
 
     flown = fly(load_mission(scenario), seed)
+    return mission_recording(flown), flight_words(flown)
+
+
+def flight_words(flown: Flown) -> str:
+    """Return what became of a mission, in a sentence."""
     said = f"{flown.mission.description} ({len(flown.batch):,} events, seed {flown.seed}): {flown.end}"
     if flown.contact is not None:
         touch = flown.contact
         said += f", contact at {touch.speed_mps:.2f} m/s, {touch.miss_m:.2f} m from the target's centre"
-    return mission_recording(flown), said
+    return said
 
 
 def run_demo(folder: str | Path, *, seed: int = 1, force: bool = False) -> str:
-    """Simulate a landing, replay it, write log, estimates and report to a folder, and say where they are.
+    """Fly a landing on rendered pictures, replay its log, write log, estimates and report to a folder, and say what
+    became of it and where they are.
 
     The reference engine is used: it starts at once, whereas the compiled one is compiled at its first use.
     """
+    from deckfix.rendered import fly_rendered, write_rendered
     from deckfix.replaying import replay
+    from estimation.landing import EXPLANATIONS
+    from simulation.mission import load_mission
 
     target = output_folder(folder)
     log, estimate, page = (target / name for name in ("flight.mcap", "estimate.mcap", "report.html"))
     for path in (log, estimate, page):
         check_output(path, force=force)
-    said = [simulate_flight(DEMO_SCENARIO, log, seed=seed, force=force)]
+    with working("flying a landing, search to touchdown, on rendered pictures"):
+        flown, companion = fly_rendered(load_mission(DEMO_MISSION), seed, engine="filterpy")
+    with output_file(log, force=force) as partial:
+        write_rendered(partial, flown, companion)
+    said = [flight_words(flown)]
+    said += [
+        f"  {t:6.1f} s  {mode.name.lower()}: {EXPLANATIONS[reason]}" for t, mode, reason in flown.transitions
+    ]
+    counts = companion.pipeline.counts
+    said.append(f"{counts['fixes']} of {counts['images']} pictures gave a fix of the target; wrote {log}")
     with working("replaying"):
         result = replay(log, engine="filterpy")
     result.write(estimate, force=force)

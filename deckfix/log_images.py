@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from deckfix.files import InputError
 from deckfix.parallel import WorkerLost, Workers
-from deckfix.pipeline import UNDECODABLE, DetectorSettings, ImageEvent, body_to_camera, fix_event, look_at
+from deckfix.pipeline import (
+    UNDECODABLE,
+    VISION_ENGINES,
+    DetectorSettings,
+    ImageEvent,
+    body_to_camera,
+    fix_event,
+    look_at,
+)
 from deckfix.reference import Trajectory, quaternion_column
 from deckfix.video_import import CAMERA_NAME, TARGET_NAME
 from estimation.clockbank import ClockBank
@@ -50,8 +58,6 @@ ATTITUDE_RATE_HZ = 100.0
 """Rate of the first pass's estimates, between which the attitude is interpolated."""
 RATE_NS = 20_000_000
 """The body's rate is the mean of the inertial samples this close to the image."""
-VISION_ENGINES = {"auto": "auto", "compiled": "compiled", "filterpy": "numpy"}
-"""The detector's engine beside the filter's: reference with reference, compiled with compiled."""
 
 
 @dataclass(frozen=True, slots=True)

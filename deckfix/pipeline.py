@@ -52,6 +52,9 @@ PRIOR_SHARE = 0.1
 RATE_NS = 20_000_000
 """The body's rate is the mean of the inertial samples this close to the image."""
 
+VISION_ENGINES = {"auto": "auto", "compiled": "compiled", "filterpy": "numpy"}
+"""The detector's engine beside the filter's: reference with reference, compiled with compiled."""
+
 UNDECODABLE = "the image cannot be decoded"
 """The reason of an image that is damaged, or of a format that is not known."""
 
@@ -132,7 +135,9 @@ class Pipeline:
         self._lever_m = np.array(self.config.vision.lever_arm_m)
         if self.camera is not None and self.target is not None:
             s = msgspec.structs.asdict(self.settings)
-            self._detector = TargetDetector(self.camera, self.target, R_cb=self._R_cb, **s)
+            self._detector = TargetDetector(
+                self.camera, self.target, R_cb=self._R_cb, engine=VISION_ENGINES[self.engine], **s
+            )
 
     def step(self, event: Event | ImageEvent) -> Step:
         """Take one event or image, in the order of arrival."""

@@ -22,12 +22,11 @@ import numpy as np
 from deckfix.files import InputError, check_output, output_file, output_folder
 from estimation.config import Config, dump_config
 from estimation.estimator import EngineName
-from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, quat_to_matrix
 from simulation.autopilot import ASK_TIME_S, HEARTBEAT_S, Autopilot, Lens
-from simulation.flight import deck_axes
+from simulation.exposure import CAMERA, expose, renderer_of
 from simulation.instruments import Instant
 from simulation.mission import Mission
-from simulation.renderer import Renderer, Scene
+from simulation.renderer import Renderer
 from simulation.world import TICK_S, Flown
 from vision.camera import Camera
 from vision.target import RingTarget
@@ -37,7 +36,6 @@ PICTURE_DELAY_S = 0.05
 """From the exposure of a picture to its sending."""
 LATEST_S = 3.0
 """A simulation this far behind real time is given up."""
-CAMERA = "rpi-v2-640x480"
 _BOUNDARY = b"picture"
 
 
@@ -87,21 +85,7 @@ class Pictures:
 
     def render(self, now: Instant) -> bytes | None:
         """Return a moment's picture as JPEG, or None where the camera is not above the deck."""
-        import cv2
-
-        v = self.config.vision
-        R_bc = quat_to_matrix(euler_to_quat(*v.mount_rpy_rad)) @ R_CB_NOMINAL.T
-        R_nc = now.R_nb @ R_bc
-        place = now.position_m + now.R_nb @ np.array(v.lever_arm_m) - now.deck_m
-        deck: Array = deck_axes(now.deck_normal[None])[0]
-        try:
-            image = self.renderer.render(
-                R_nc, place, self.rng, R_nd=deck, rate_c_radps=R_bc.T @ now.angular_velocity_radps
-            )
-        except ValueError:
-            return None
-        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])
-        return bytes(data) if done else None
+        return expose(self.renderer, self.config.vision, now, self.rng, np.zeros(3))
 
     def after(self, number: int, timeout_s: float) -> tuple[int, bytes]:
         """Return the newest picture once its number is higher than ``number``, or the last one after a time."""
@@ -248,8 +232,7 @@ class Served:
 
 def serve(mission: Mission, seed: int | None, ports: Ports, engine: EngineName = "auto") -> Served:
     """Return a mission's vehicle, ready to run; raises ``InputError`` where a port is taken."""
-    target = RingTarget.recommended(mission.target_m)
-    renderer = Renderer(Camera.preset(CAMERA), target, Scene(deck_m=max(mission.deck_m, target.side_m)))
+    renderer = renderer_of(mission)
     number = mission.seed if seed is None else seed
     pictures = Pictures(renderer, mission.drawn, np.random.default_rng([number, 78]))
     lens = Lens(lambda now: None)

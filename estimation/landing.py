@@ -192,6 +192,11 @@ def inside_probability(mean: Array, covariance: Array, radius: float) -> float:
 
     if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(covariance))):
         return 0.0
+    # Certain where the circle's edge is seven sigmas away, which is most of the time.
+    a, b, c = float(covariance[0, 0]), float(covariance[1, 1]), float(covariance[0, 1])
+    largest = 0.5 * (a + b) + math.hypot(0.5 * (a - b), c)
+    if radius - math.hypot(mean[0], mean[1]) > 7.0 * math.sqrt(max(largest, 0.0)):
+        return 1.0
     values, axes = np.linalg.eigh(covariance)
     m = axes.T @ mean
     sigma = np.sqrt(np.maximum(values, (1e-6 * radius) ** 2))

@@ -32,9 +32,8 @@ from estimation.events import (
 )
 from estimation.frames import Array, quat_exp, quat_multiply, quat_to_matrix
 from estimation.landing import Decision, Progress, Situation
-from estimation.output import Estimate
 from simulation import vehicle as body
-from simulation.instruments import Instant, Seeing
+from simulation.instruments import Instant
 from simulation.mission import Mission
 from simulation.world import LEGS_LOADED_S, SETPOINT_TIMEOUT_S, TICK_S, World
 
@@ -77,13 +76,10 @@ class Lens:
 
     take: Callable[[Instant], None]
 
-    def seeing(self, newest: Callable[[], Estimate | None], rng: np.random.Generator) -> Seeing:
-        """Return what is called at each picture."""
-
-        def see(now: Instant) -> None:
-            self.take(now)
-
-        return see
+    def __call__(self, now: Instant) -> bool:
+        """Hand on the moment of a picture, which is no message of the vehicle's own."""
+        self.take(now)
+        return False
 
 
 @dataclass(slots=True)

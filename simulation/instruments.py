@@ -11,15 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimation.config import Config
-from estimation.events import AUTOPILOT, COMPANION, EVENT_DTYPE, EventBatch, Kind
+from estimation.events import AUTOPILOT, COMPANION, EVENT_DTYPE, EventBatch, Kind, Names, VisionFix, pack
 from estimation.frames import Array, ned_to_geodetic, quat_exp, quat_multiply
-from simulation.fixes import CameraErrors, noisy, seen_from
+from simulation.fixes import CameraErrors, View, noisy, seen_from
 from simulation.sensors import (
     CLOCKS,
     Clock,
@@ -55,11 +54,10 @@ class Instant:
     deck_normal: Array
 
 
-class Seeing(Protocol):
-    """What turns a moment into a fix: a drawn one, or one from a rendered picture."""
-
-    def __call__(self, now: Instant) -> tuple[Array, Array] | None:
-        """Return P^c (3,) and its covariance's upper triangle (6,), NaN where it states none; None without a fix."""
+Seeing = Callable[[Instant], bool]
+"""What is told the moment of each picture, in place of drawn fixes; it says whether the picture comes as a message of
+this flight, whose fix ``settle`` then fills in.
+"""
 
 
 Fill = Callable[[Instant, int], Array | None]
@@ -107,11 +105,12 @@ class Instruments:
     @classmethod
     def draw(
         cls, config: Config, streams: Streams, clocks: Mapping[str, Clock], place: Place, duration_s: float,
-        rng: np.random.Generator, see: Seeing | None = None,
+        rng: np.random.Generator, see: Seeing | None = None, view: View | None = None,
     ) -> Instruments:  # fmt: skip
         """Draw everything that the motion does not decide, for a flight of at most ``duration_s``.
 
-        ``see`` replaces the fixes that are drawn from the description. Each sensor draws from a generator of its own.
+        ``see`` replaces the fixes that are drawn from the description; ``view`` tells where there are such, unless
+        ``streams`` does. Each sensor draws from a generator of its own.
         """
         made = cls(config, place, clocks)
         generators = iter(rng.spawn(7))
@@ -128,7 +127,7 @@ class Instruments:
             made._attitude(streams.attitude, duration_s, own)
         own = next(generators)
         if streams.vision is not None:
-            made._vision(streams.vision, duration_s, own, see)
+            made._vision(streams.vision, duration_s, own, see, streams.vision.view or view or View())
         made._lay_out(streams.timesync, duration_s, next(generators))
         return made
 
@@ -160,10 +159,22 @@ class Instruments:
 
     def until(self, t_s: float) -> EventBatch:
         """Return what has arrived by a time and was not given before, in the order of arrival."""
-        end = max(self._given, int(np.searchsorted(self.arrival_s, t_s, side="right")))
-        chosen = slice(self._given, end)
-        self._given = end
-        return EventBatch(self.rows[chosen][self.there[chosen]], self.names, CLOCKS)
+        return EventBatch(self.rows[self.arrived(t_s)], self.names, CLOCKS)
+
+    def arrived(self, t_s: float) -> Times:
+        """Return the numbers of the rows that ``until`` would give."""
+        begin = self._given
+        self._given = max(begin, int(np.searchsorted(self.arrival_s, t_s, side="right")))
+        numbers: Times = begin + np.flatnonzero(self.there[begin : self._given])
+        return numbers
+
+    def settle(self, number: int, fix: VisionFix | None) -> None:
+        """Write what was found in a picture into its row, or take the row out where there was no fix."""
+        if fix is None:
+            self.there[number] = False
+            return
+        found = np.array([pack(fix, Names())], dtype=EVENT_DTYPE)[0]
+        self.rows["value"][number], self.rows["covariance"][number] = found["value"], found["covariance"]
 
     def given(self) -> EventBatch:
         """Return all that was given out so far."""
@@ -286,12 +297,18 @@ class Instruments:
     # -- rows ------------------------------------------------------------------------------------------------------
 
     def _vision(
-        self, stream: VisionStream, duration_s: float, rng: np.random.Generator, see: Seeing | None
+        self,
+        stream: VisionStream,
+        duration_s: float,
+        rng: np.random.Generator,
+        see: Seeing | None,
+        view: View,
     ) -> None:
         c = self.config.vision
         t = sample_times(stream, duration_s)
         errors = CameraErrors.draw(c, t, rng)
         age = np.full(len(t), c.latency_s)
+        white = int(rng.integers(1 << 62))
         if see is None:
             age += errors.latency_s
             self.slow["range_scale"] = SlowError(t, np.full((len(t), 1), errors.scale))
@@ -300,10 +317,9 @@ class Instruments:
 
         def fill(now: Instant, k: int) -> Array | None:
             if see is not None:
-                found = see(now)
-                return None if found is None else np.concatenate([found[0], np.full(3, np.nan), found[1]])
+                return np.full(12, np.nan) if see(now) else None
             true = seen_from(c, now.position_m[None], now.R_nb[None], now.deck_m[None], errors.mount_rad)
-            one = noisy(c, stream.view, t[k : k + 1], true, errors, rng)
+            one = noisy(c, view, t[k : k + 1], true, errors, np.random.default_rng([white, k]))
             if not one.seen[0]:
                 return None
             stated = one.covariance_m2[0] if stream.covariance else np.full(6, np.nan)

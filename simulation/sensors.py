@@ -58,13 +58,16 @@ class Stream(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=Tr
 
 
 class VisionStream(Stream, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """How vision fixes come: late, and stamped by the companion. ``covariance`` says whether they state theirs."""
+    """How vision fixes come: late, and stamped by the companion. ``covariance`` says whether they state theirs.
+
+    Without a ``view`` it is ``View()``, or that of the mission's target.
+    """
 
     rate_hz: _Positive = 30.0
     first_s: _NotNegative = 0.005
     delay_s: _NotNegative = 0.06
     clock: str = COMPANION
-    view: View = View()
+    view: View | None = None
     covariance: bool = True
 
 
@@ -297,7 +300,7 @@ class Sensors:
         c = self.config.vision
         t = sample_times(stream, trajectory.plan.duration_s)
         errors = CameraErrors.draw(c, t, rng)
-        found = draw_fixes(c, stream.view, trajectory, t, errors, rng)
+        found = draw_fixes(c, stream.view or View(), trajectory, t, errors, rng)
         constant = np.ones((len(t), 1))
         slow["range_scale"] = SlowError(t, errors.scale * constant)
         slow["camera_latency"] = SlowError(t, errors.latency_s[:, None])

@@ -54,13 +54,19 @@ class Turbulence:
         States z' = -a z + n, y' = -a y + a z have the exact transition exp(-a dt) [[1, 0], [a dt, 1]]; the noise of a
         step is what that takes away from the stationary covariance.
         """
-        z = self._vw[k]
-        phi = math.exp(-a * dt) * np.array([[1.0, 0.0], [a * dt, 1.0]])
-        stationary = np.array([[0.5, 0.25], [0.25, 0.25]]) / a
-        noise = stationary - phi @ stationary @ phi.T
-        root = np.linalg.cholesky(noise + 1e-18 * np.eye(2))
-        z[:] = phi @ z + root @ white
+        # By hand: matrices of two rows, many times a second.
+        z, y = self._vw[k].tolist()
+        e, q = math.exp(-a * dt), a * dt
+        r11 = 0.5 * (1.0 - e * e) / a
+        r21 = (0.25 - e * e * (0.5 * q + 0.25)) / a
+        r22 = (0.25 - e * e * (0.5 * q * q + 0.5 * q + 0.25)) / a
+        l11 = math.sqrt(r11 + 1e-18)
+        l21 = r21 / l11
+        l22 = math.sqrt(max(r22 + 1e-18 - l21 * l21, 0.0))
+        w1, w2 = white.tolist()
+        z, y = e * z + l11 * w1, e * (q * z + y) + l21 * w1 + l22 * w2
+        self._vw[k] = z, y
         # sqrt(3) z + (1 - sqrt(3)) y has the variance (1/a) (3/2 + (1 - r)^2/4 + r (1 - r)/2), r = sqrt(3): 1/a.
         r = math.sqrt(3.0)
         variance = (r * r * 0.5 + (1.0 - r) ** 2 * 0.25 + 2.0 * r * (1.0 - r) * 0.25) / a
-        return float(sigma * (r * z[0] + (1.0 - r) * z[1]) / math.sqrt(variance))
+        return float(sigma * (r * z + (1.0 - r) * y) / math.sqrt(variance))

@@ -8,6 +8,7 @@ engine and one set of versions.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from estimation.frames import Array, normal_gravity, quat_conjugate, quat_multip
 from estimation.landing import Decision, Mode, Progress, Reason, Situation, step
 from estimation.output import Estimate, Facts
 from simulation import vehicle as body
+from simulation.fixes import View
 from simulation.flight import place_of, waves_of, wind_speed_mps
 from simulation.instruments import Instant, Instruments, Seeing
 from simulation.mishaps import afflict, clock_error_ns
@@ -46,11 +48,27 @@ _DECK_CHUNK_S = 10.0
 Guidance = Callable[[Progress, Situation, LandingConfig], tuple[Progress, Decision]]
 
 
-class Camera(Protocol):
-    """What sees the target in a closed loop: told the newest estimate before each picture."""
+class Computer(Protocol):
+    """What estimates on board, in place of an estimator alone."""
 
-    def seeing(self, newest: Callable[[], Estimate | None], rng: np.random.Generator) -> Seeing:
-        """Return what turns a moment into a fix."""
+    @property
+    def estimator(self) -> LandingEstimator:
+        """The estimator that is fed."""
+
+    def take(self, instruments: Instruments, t_s: float) -> Estimate | None:
+        """Take what has arrived by a time, and return the newest estimate if one came."""
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """An estimator that gets every message as it is."""
+
+    estimator: LandingEstimator
+
+    def take(self, instruments: Instruments, t_s: float) -> Estimate | None:
+        """Take what has arrived by a time, and return the newest estimate if one came."""
+        batch = instruments.until(t_s)
+        return self.estimator.feed(batch).estimate if len(batch) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,20 +127,27 @@ def fly(
     *,
     engine: EngineName = "auto",
     guidance: Guidance = step,
-    camera: Camera | None = None,
+    camera: Seeing | None = None,
+    computer: Computer | None = None,
     watch: Callable[[float, Decision | None], None] | None = None,
 ) -> Flown:
     """Fly a mission: the same for the same mission and seed (None: the mission's own).
 
-    ``guidance`` decides (the landing modes); ``camera`` sees the target in place of fixes drawn from the description;
+    ``guidance`` decides (the landing modes); ``camera`` is told the moment of each picture, in place of fixes drawn
+    from the description, and ``computer`` takes the messages (None: an estimator alone);
     ``watch`` is told the time and the last decision at every tick.
     """
-    world = World(mission, mission.seed if seed is None else seed, engine, guidance, camera)
+    world = World(mission, mission.seed if seed is None else seed, engine, guidance, camera, computer)
     while not world.end:
         world.tick()
         if watch is not None:
             watch(world.t_s, world.decisions[-1] if world.decisions else None)
     return world.flown()
+
+
+def facts_of(mission: Mission) -> Facts:
+    """Return what the autopilot of a mission tells of its sensors."""
+    return Facts(imu_latency_s=mission.drawn.imu.latency_s or 0.0)
 
 
 @dataclass(slots=True)
@@ -133,7 +158,8 @@ class World:
     seed: int
     engine: EngineName
     guidance: Guidance
-    camera: Camera | None
+    camera: Seeing | None
+    computer: Computer | None = None
     t_s: float = 0.0
     end: str = ""
     decisions: list[Decision] = field(default_factory=list)
@@ -152,7 +178,7 @@ class World:
     place: Place = field(init=False)
     platform: Platform = field(init=False)
     instruments: Instruments = field(init=False)
-    estimator: LandingEstimator = field(init=False)
+    _computer: Computer = field(init=False)
     _landing: LandingConfig = field(init=False)
     _air: Turbulence = field(init=False)
     _forecaster: DeckForecaster = field(init=False)
@@ -169,21 +195,24 @@ class World:
 
     def __post_init__(self) -> None:
         m = self.mission
-        sea_rng, air_rng, sensing, seeing, luck = np.random.default_rng(self.seed).spawn(5)
+        # The fourth has no user: what the others draw depends on their number.
+        sea_rng, air_rng, sensing, _, luck = np.random.default_rng(self.seed).spawn(5)
         self.place = place_of(m.site, m.drawn)
         self.platform = Platform.draw(m.raft, Sea.draw(waves_of(m.sea), sea_rng), sea_rng)
         speed = wind_speed_mps(m.wind, m.sea)
         self._air = Turbulence(speed, math.radians(m.wind.direction_deg), air_rng)
-        see = None if self.camera is None else self.camera.seeing(lambda: self._estimate, seeing)
+        view = View.of_target(m.target_m)
         self.instruments = Instruments.draw(
-            m.drawn, m.streams, m.clocks, self.place, m.longest_s, sensing, see
+            m.drawn, m.streams, m.clocks, self.place, m.longest_s, sensing, self.camera, view
         )
         afflict(self.instruments, m.mishaps, luck)
-        facts = Facts(imu_latency_s=m.drawn.imu.latency_s or 0.0)
         self._landing = m.config.landing
-        self.estimator = LandingEstimator(m.config, engine=self.engine, facts=facts)
+        if self.computer is None:
+            self._computer = Filter(LandingEstimator(m.config, engine=self.engine, facts=facts_of(m)))
+        else:
+            self._computer = self.computer
         self._forecaster = DeckForecaster.at(HORIZONS_S)
-        self._advance = body.compiled()
+        self._advance = body.advance if self.engine == "filterpy" else body.compiled()
         gravity = normal_gravity(float(self.place.origin[0]), float(self.place.origin[2]))
         self._p = body.pack(m.airframe, gravity, m.deck_m)
         self._x, self._own = np.zeros(body.STATE_SIZE), np.zeros(body.OWN_SIZE)
@@ -235,6 +264,22 @@ class World:
         self._decide()
         self._judge()
 
+    def branch(self, guidance: Guidance) -> World:
+        """Return a flight that is the same up to now and goes on under other guidance, on the same sea and sensors.
+
+        Raises ``ValueError`` where mishaps or a computer of its own remember what was.
+        """
+        if self.mission.mishaps or self.computer is not None:
+            raise ValueError("mission: a flight with mishaps or a computer of its own cannot be branched")
+        made = copy.deepcopy(self)
+        made.guidance = guidance
+        return made
+
+    @property
+    def landing_mode(self) -> Mode:
+        """What the landing is at."""
+        return self._progress.mode
+
     # -- the truth -------------------------------------------------------------------------------------------------
 
     def _deck_now(self) -> Array:
@@ -272,13 +317,10 @@ class World:
     # -- estimate and decision -------------------------------------------------------------------------------------
 
     def _take_in(self) -> None:
-        batch = self.instruments.until(self.t_s)
-        if not len(batch):
-            return
-        out = self.estimator.feed(batch)
-        if out.estimate is not None:
-            self._estimate = out.estimate
-        seen = self.estimator.last_fused_ns(Kind.VISION)
+        estimate = self._computer.take(self.instruments, self.t_s)
+        if estimate is not None:
+            self._estimate = estimate
+        seen = self._computer.estimator.last_fused_ns(Kind.VISION)
         if seen is not None:
             self._seen_ns = seen
         self._correct()
@@ -298,8 +340,9 @@ class World:
         turn = quat_multiply(e.quaternion, quat_conjugate(then[3:7]))
         self._own[:3] += velocity
         self._past[:, :3] += velocity
-        for row in (self._own, *self._past):
-            row[3:7] = quat_multiply(turn, row[3:7])
+        left = np.stack([quat_multiply(turn, unit) for unit in np.eye(4)])
+        self._own[3:7] = self._own[3:7] @ left
+        self._past[:, 3:7] = self._past[:, 3:7] @ left
 
     def _now_ns(self) -> int:
         shown = int(self.instruments.stamp_ns(AUTOPILOT, np.array([self.t_s]))[0])
@@ -316,7 +359,7 @@ class World:
         now = self._now_ns()
         age = math.inf if self._seen_ns is None else max(0.0, (now - self._seen_ns) * 1e-9)
         situation = Situation(
-            now, self._estimate, age, self.estimator.deck_forecast(self._forecaster),
+            now, self._estimate, age, self._computer.estimator.deck_forecast(self._forecaster),
             bool(self._own[body.LOADED] > LEGS_LOADED_S),
         )  # fmt: skip
         self._progress, decision = self.guidance(self._progress, situation, self._landing)

@@ -12,11 +12,11 @@ import pytest
 from deckfix.demo import simulate_flight
 from estimation.config import ConfigError
 from estimation.events import Kind
-from estimation.landing import Mode
+from estimation.landing import Mode, step
 from logs import open_flight
 from simulation.mission import load_mission, mission_names, parse_mission
 from simulation.sensors import Clock
-from simulation.world import Flown, fly
+from simulation.world import Flown, World, fly
 
 MISSION = "landing_beaufort2_2026_11"
 
@@ -94,3 +94,15 @@ def test_an_unknown_mission_is_refused_with_the_known_ones() -> None:
     assert MISSION in mission_names()
     with pytest.raises(ConfigError, match=MISSION):
         load_mission("nowhere")
+
+
+def test_a_flight_that_is_branched_goes_on_as_it_would_have() -> None:
+    world = World(load_mission(MISSION), 1, "auto", step, None)
+    while world.t_s < 12.0:
+        world.tick()
+    branch = world.branch(step)
+    for one in (world, branch):
+        for _ in range(100):
+            one.tick()
+    assert world.flown().truth.tobytes() == branch.flown().truth.tobytes()
+    assert world.flown().batch.rows.tobytes() == branch.flown().batch.rows.tobytes()
