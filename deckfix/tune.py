@@ -26,7 +26,7 @@ from deckfix.terminal import printable, working
 from deckfix.tune_objective import Refused, Score, Trial, score
 from deckfix.tune_parameters import Parameter, choose, with_values
 from deckfix.tune_report import Tuned, TunedFlight, provenance, report
-from deckfix.tune_search import Certainty, Found, Search
+from deckfix.tune_search import WORTH, Certainty, Found, Search
 from estimation.config import Config, dump_config, load_config, parse_config
 from estimation.frames import Array
 
@@ -169,6 +169,8 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
     point, sigma = centre.copy(), np.full(len(centre), np.inf)
     at_bound = np.zeros(len(centre), dtype=bool)
     found: Found | None = None
+    certainty: Certainty | None = None
+    keep = np.ones(len(centre), dtype=bool)
     evaluations = 0
     while True:
         fixed = tuple((p.name, p.start) for k, p in enumerate(parameters) if k not in free)
@@ -182,10 +184,15 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
             rng = np.random.default_rng(replays.options.seed)
             draws = [rng.uniform(-DRAWN, DRAWN, len(free)) for _ in range(replays.options.starts - 1)]
             ends = [search.run(centre[free] + d) for d in (np.zeros(len(free)), *draws)]
-            found = min(ends, key=lambda e: e.value)
+            found, certainty = search.certainty(min(ends, key=lambda e: e.value))
         else:
-            found = search.run(point[free], sweep=False)
-        found, certainty = search.certainty(found)
+            assert certainty is not None
+            value = float(search.values([point[free]])[0])
+            if value < found.value + WORTH:
+                # What is held now made no difference: the rest is at its best already.
+                found, certainty = Found(point[free], value, 0), certainty.kept(keep)
+            else:
+                found, certainty = search.certainty(search.run(point[free], sweep=False))
         evaluations += search.evaluations
         point[free] = found.point
         sigma[:], at_bound[:] = np.inf, False
@@ -203,7 +210,7 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
     values[free] = point[free]
     rounded = [float(f"{v:.{DIGITS}g}") for v in np.exp(values)]
     whole = [p.start if k not in free else rounded[k] for k, p in enumerate(parameters)]
-    return whole, Certainty(sigma, at_bound), evaluations * len(replays.paths)
+    return whole, Certainty(sigma, at_bound, certainty.information), evaluations * len(replays.paths)
 
 
 def _first(replays: _Replays, files: Sequence[str], remarks: list[str]) -> list[Score | Refused]:

@@ -49,16 +49,23 @@ class Found:
 @dataclass(frozen=True, slots=True)
 class Certainty:
     """How well log-parameters are known: 1-sigma (p,), infinite where the objective is not curved; ``at_bound`` (p,)
-    those that lie on a bound, where no sigma means anything."""
+    those that lie on a bound, where no sigma means anything; ``information`` (p, p) the Hessian, without these."""
 
     sigma: Array
     at_bound: NDArray[np.bool_]
+    information: Array
 
     @property
     def identified(self) -> NDArray[np.bool_]:
         """Which parameters the flights tell of."""
         known: NDArray[np.bool_] = (self.sigma < KNOWN) & ~self.at_bound
         return known
+
+    def kept(self, keep: NDArray[np.bool_]) -> Certainty:
+        """Return how well some of the parameters are known when the others are held where they are."""
+        information = self.information[np.ix_(keep, keep)]
+        at_bound = self.at_bound[keep]
+        return Certainty(_sigmas(information, ~at_bound), at_bound, information)
 
 
 @dataclass(slots=True)
@@ -125,26 +132,22 @@ class Search:
         x, n = found.point, len(found.point)
         at_bound = (x - self.lower < AT_BOUND) | (self.upper - x < AT_BOUND)
         free = np.flatnonzero(~at_bound)
-        sigma = np.full(n, np.inf)
+        information = np.zeros((n, n))
         if not len(free):
-            return found, Certainty(sigma, at_bound)
+            return found, Certainty(np.full(n, np.inf), at_bound, information)
         room = np.minimum(x - self.lower, self.upper - x)
         _, curvature = self._derivatives(x, found.value, np.minimum(STEP, room), free)
         wanted = np.clip(1.0 / np.sqrt(np.maximum(curvature, 1e-9)), LEAST_STEP, LARGEST_STEP)
         steps = np.minimum(wanted, room)
         H, gradient = self._hessian(x, found.value, steps, free)
+        information[np.ix_(free, free)] = H
         shift = np.zeros(n)
-        try:
-            np.linalg.cholesky(H)
-            sigma[free] = np.sqrt(np.diag(np.linalg.inv(H)))
+        if np.linalg.eigvalsh(H)[0] > 0.0:
             shift[free] = -np.linalg.solve(H, gradient)
-        except np.linalg.LinAlgError:
-            # Not a minimum in every direction: what is known is what is curved by itself and with the rest that is.
-            sigma[free] = _partly(H)
         y = np.clip(x + np.clip(shift, -0.5, 0.5), self.lower, self.upper)
         value = float(self.values([y])[0])
         better = Found(y, value, self.evaluations) if value < found.value else found
-        return better, Certainty(sigma, at_bound)
+        return better, Certainty(_sigmas(information, ~at_bound), at_bound, information)
 
     def _swept(self, point: Array, value: float) -> tuple[Array, float]:
         for k in range(len(point)):
@@ -194,13 +197,14 @@ def _moved(x: Array, k: int | np.int64, by: float) -> Array:
     return y
 
 
-def _partly(H: Array) -> Array:
-    """Return sigmas (f,) from the largest set of parameters whose Hessian is positive, infinite for the others."""
-    kept = list(np.argsort(-np.diag(H)))
-    while kept:
-        part = H[np.ix_(kept, kept)]
-        if np.linalg.eigvalsh(part)[0] > 0.0:
-            break
+def _sigmas(H: Array, free: NDArray[np.bool_]) -> Array:
+    """Return sigmas (p,) of the free parameters from the Hessian (p, p).
+
+    Where it is not positive, from the largest part of it that is; infinite for the others.
+    """
+    order = np.argsort(-np.diag(H))
+    kept = [int(k) for k in order if free[k]]
+    while kept and np.linalg.eigvalsh(H[np.ix_(kept, kept)])[0] <= 0.0:
         kept.pop()
     sigma = np.full(len(H), np.inf)
     if kept:
