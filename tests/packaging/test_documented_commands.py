@@ -121,13 +121,26 @@ def test_the_commands_of_a_page_run(
             print(f"\nnot run: {line}", end="")
 
 
-def test_the_targets_of_the_makefile_that_are_shown_run(
+def made_by_make() -> list[str]:
+    """Return the deckfix commands of the Makefile's targets that the pages show."""
+    targets = sorted({c.split()[1] for _, c in ALL if c.startswith("make ") and reason(c) is None})
+    return [command for target in targets for command in recipe(target)]
+
+
+def test_the_recipes_of_the_makefile_parse() -> None:
+    assert made_by_make() == ["deckfix demo -o demo --force"]
+    parsed(made_by_make()[0])
+
+
+@pytest.mark.nightly
+def test_the_recipes_of_the_makefile_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    """The demo flies a whole landing on rendered pictures, which takes more than a minute."""
     monkeypatch.chdir(tmp_path)
-    for command in sorted({c for _, c in ALL if c.startswith("make ") and reason(c) is None}):
-        for made in recipe(command.split()[1]):
-            run(made, tmp_path, {}, capfd)
+    for command in made_by_make():
+        run(command, tmp_path, {}, capfd)
+    assert (tmp_path / "demo" / "report.html").stat().st_size > 1_000_000
 
 
 def ulog(command: str, folder: Path, capfd: pytest.CaptureFixture[str]) -> list[str]:
