@@ -61,7 +61,7 @@ ALL = (
     Benchmark("read_columns", "reading columns over the mcap reader", ("--duration", "60")),
     Benchmark("import_speed", "decoding .BIN over pymavlink"),
     Benchmark("fix_model", "what a camera's fixes are, against rendered pictures", ("--moments", "20")),
-    Benchmark("landings", "landings flown in a closed loop", ("--landings", "8")),
+    Benchmark("landings", "landings flown in a closed loop", ("--landings", "8"), ("--full",)),
     Benchmark("onboard", "latency from frame to LANDING_TARGET", ("--seconds", "60"), ("--full",)),
     Benchmark("aided", "horizontal error against smsfusion's AidedINS"),
 )  # fmt: skip

@@ -84,13 +84,13 @@ def missed_baselines(found: dict[str, Any], baseline: dict[str, Any]) -> list[st
         name, old = then["name"], then["value"]
         if old is None:
             continue
-        new = now[name]["value"] if name in now else None
-        if new is None:
+        if name not in now or now[name]["value"] is None:
             out.append(f"{name}: was {old:.6g}, and is not measured any more")
             continue
+        new = now[name]["value"]
         spread = then.get("spread")
         allowed = TOLERANCE * abs(old) if spread is None else spread
-        worse = old - new if then.get("at_least") else new - old
+        worse = old - new if now[name]["at_least"] else new - old
         if worse > allowed + 1e-12:
             out.append(f"{name}: was {old:.6g}, is {new:.6g}; a spread of {allowed:.3g} is allowed")
     return out
