@@ -138,7 +138,7 @@ def boards() -> tuple[bytes, ...]:
     metres = np.array([[1.0, 0.0, -width / 2.0], [0.0, 1.0, -height / 2.0], [0.0, 0.0, 1.0]])
     metres[:2] *= 0.025 / px
     out = []
-    for k in range(12):
+    for k in range(8):
         angle = 0.55 * np.array([np.sin(2.1 * k), np.cos(2.1 * k), 0.3 * np.sin(k)])
         R = cv2.Rodrigues(angle)[0]
         place = np.array([0.06 * np.sin(1.3 * k), 0.05 * np.cos(1.7 * k), 0.42 + 0.02 * (k % 4)])
