@@ -67,6 +67,8 @@ propeller wash and no delay, the propellers shake nothing and the inertial senso
 EKF3 flies parameters for real sensors and learns a field that is not there; the ratios flatter us by that.
 NIS far below 1 is the other side of it: the default noises are for real receivers."""
 
+WITHOUT_VISION = "[platform]\nuse = false\n"
+"""The merged logs hold vision fixes, of which EKF3 makes no use."""
 RTK_CONFIG = """\
 [gps]               # RTK: centimetres, no slow error to carry, stamped at its own time
 bias = false
@@ -91,7 +93,7 @@ def sitl(folder: Path, targets: Targets) -> list[Row]:
             for suffixes in ((".BIN",), (".BIN", ".tlog")):
                 files = [folder / "ardupilot_sitl" / (name + s) for s in suffixes]
                 flight = imported(files, Path(scratch))
-                result = deckfix.replay(flight)
+                result = deckfix.replay(flight, parse_config(WITHOUT_VISION))
                 row = sitl_row(name, "+".join(s[1:] for s in suffixes), result)
                 if alone is not None:
                     row["position_alone_less_merged_m"] = largest_difference(alone, result.run)

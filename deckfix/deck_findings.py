@@ -31,7 +31,7 @@ def deck_findings(result: Result) -> Iterator[Finding]:
             Severity.NOTE,
             "the log holds vision fixes, but the platform is switched off",
             "platform.use is false in the configuration",
-            "set platform.use = true to estimate the platform",
+            "leave platform.use at 'auto', or set it to true, to estimate the platform",
         )
         return
     yield from _clocks(result)

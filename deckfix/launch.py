@@ -7,7 +7,7 @@ import hashlib
 import signal
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -29,7 +29,7 @@ from estimation.ahead import DeckForecaster
 from estimation.config import Config, ConfigError
 from estimation.estimator import EngineName, LandingEstimator
 from estimation.heave.model import fit
-from estimation.output import Facts
+from estimation.output import Facts, with_platform
 from logs.ardupilot import filter_delay
 from simulation.flight import parse_scenario, simulate
 from vision.camera import Camera
@@ -96,6 +96,8 @@ def prepare(options: Options, setup: FlightFile, say: Callable[[str], None]) -> 
     Raises ``InputError``, ``OutputError`` or ``ConfigError`` with what is wrong and what to do.
     """
     _check(options, setup)
+    # The log carries what was flown: its replay must not depend on whether the camera found anything.
+    setup = replace(setup, config=with_platform(setup.config, options.camera is not None))
     clock = CompanionClock()
     path = None if options.record is None else log_path(options.record, clock())
     say("preparing the estimator and the detector (at the first start this takes a minute)")
@@ -113,7 +115,7 @@ def prepare(options: Options, setup: FlightFile, say: Callable[[str], None]) -> 
         for line in remarks(link, options):
             say(line)
         delay = filter_delay(link.vehicle.parameters) if link.vehicle.ardupilot else {}
-        facts = Facts(imu_latency_s=float(delay.get("latency_s", 0.0)))
+        facts = Facts(imu_latency_s=float(delay.get("latency_s", 0.0)), vision=options.camera is not None)
         pipeline = Pipeline(
             setup.config, setup.camera, setup.target, setup.table.detector, options.engine, facts
         )
@@ -152,7 +154,7 @@ def _check(options: Options, setup: FlightFile) -> None:
     if options.camera is not None and setup.target is None:
         raise InputError("no target file; name one in the configuration ([onboard] target) or with --target")
     needs = options.guide or "landing_target" in options.publish
-    if options.camera is not None and needs and not setup.config.platform.use:
+    if options.camera is not None and needs and setup.config.platform.use is False:
         raise ConfigError(
             "the configuration has platform.use = false: it estimates no deck; set it to true, or publish none"
         )
@@ -167,7 +169,7 @@ def warm_up(setup: FlightFile, engine: EngineName) -> None:
 
 def warm_estimator(config: Config, engine: EngineName) -> None:
     """Run the estimator over a few simulated seconds, with what it does only now and then: heave and forecasts."""
-    estimator = LandingEstimator(config, engine=engine)
+    estimator = LandingEstimator(config, engine=engine, facts=Facts(vision=True))
     for event in simulate(parse_scenario(_WARM_UP)).batch:
         estimator.step(event)
     estimator.deck_forecast(DeckForecaster.at(HORIZONS_S))

@@ -210,7 +210,7 @@ class Pipeline:
         if stamp is None:
             return None
         age_s = self.estimator.config.vision.latency_s
-        if self.config.platform.use and self._estimates:
+        if self.estimator.config.platform.use is True and self._estimates:
             age_s += float(self._estimates[-1].nominal[CL0])
         return stamp - round(age_s * 1e9)
 

@@ -96,7 +96,10 @@ def replay(
     known = facts(opened)
     seen = images_told(opened, batch, settings, known, engine, wanted=images, jobs=jobs)
     if seen is not None and seen.fixes is not None:
-        batch, known = seen.replace_in(batch), dataclasses.replace(known, vision_by_arrival=False)
+        batch, known = (
+            seen.replace_in(batch),
+            dataclasses.replace(known, vision_by_arrival=False, vision=True),
+        )
     begin = time.perf_counter()
     chosen: EngineName = "filterpy" if sensors and engine == "auto" else engine
     estimator = LandingEstimator(settings, engine=chosen, facts=known, smooth=smooth)
@@ -132,6 +135,7 @@ def facts(flight: Flight) -> Facts:
         vision_by_arrival=any(
             i.metadata.get("stamps") == "arrival" for i in flight.topics.get("/vision/fix", [])
         ),
+        vision=any(i.count for i in flight.topics.get("/vision/fix", [])),
     )
 
 

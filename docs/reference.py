@@ -103,6 +103,8 @@ def allowed(hint: Any, meta: msgspec.Meta) -> str:
         return ", ".join(f'`"{choice}"`' for choice in get_args(kind))
     if get_origin(kind) is tuple:
         return f"{len(get_args(kind))} numbers"
+    if len(kinds) > 1:
+        return ", ".join(allowed(k, meta) for k in kinds)
     if len(kinds) == 1:
         kind, meta = (get_args(kinds[0])[0], meta_of(kinds[0])) if get_args(kinds[0]) else (kinds[0], meta)
     word = {float: "number", int: "whole number", bool: "true, false", str: "text"}[kind]

@@ -461,7 +461,7 @@ class Aligner:
             heave = self._put_platform(P)
         memory = np.zeros((self.sensors, MEMORY_SIZE))
         clock = np.array([t, t, t], dtype=np.int64)
-        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(3), memory, heave)
+        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(4), memory, heave)
 
     def _put_platform(self, P: Array) -> Array:
         """Write what is known of the platform before it is seen into P; return the parameters of its motion."""

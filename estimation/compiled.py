@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numba.extending import overload, register_jitable
 
-from estimation import deck, frames, models, parameters, state, update
+from estimation import deck, frames, models, parameters, state, update, watch
 from estimation import rows as rows_module
 from estimation import trail as trail_module
 from estimation.codecache import jitted
@@ -32,6 +32,7 @@ from estimation.rows import (
     RESET,
     RESULT,
     SENSOR,
+    STAMP_NS,
     T_NS,
     VALUE,
     Estimates,
@@ -53,6 +54,7 @@ from estimation.update import (
     scatter_update,
     weight,
 )
+from estimation.watch import LET_GO, let_go, unexplained
 
 _FUSED = int(Outcome.FUSED)
 _FUSED_LATE = int(Outcome.FUSED_LATE)
@@ -100,7 +102,7 @@ def _put(target: Array, row: int, column: int, scale: float, block: Array) -> Ca
     return assign
 
 
-for _module in (deck, frames, models, state, update):
+for _module in (deck, frames, models, state, update, watch):
     for _function in vars(_module).values():
         if (
             inspect.isfunction(_function)
@@ -195,7 +197,7 @@ def _propagate(
 
 def _fuse(
     x: Array, P: Array, memory: Array, scatter: Array, kind: int, value: Array, own: Array, gyro: Array,
-    t_s: float, late: int, p: Array, offsets: Offsets, H: Array, result: Array,
+    t_s: float, late: int, p: Array, offsets: Offsets, heave: Array, H: Array, result: Array,
 ) -> tuple[int, int, Array]:  # fmt: skip
     n = P.shape[0]
     r = np.zeros(3)
@@ -226,6 +228,9 @@ def _fuse(
     result[15] = math.log(_determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
+    mark = 0
+    if kind == VISION and unexplained(memory, t_s, r, S, w, x, p, heave):
+        mark = LET_GO
     if w == 0.0:
         if locked_out(memory, kind, t_s, r, R, m, p):
             reset_datum(kind, x, P, r, R, m, offsets)
@@ -257,7 +262,7 @@ def _fuse(
             for j in range(first, stop):
                 P[i, j] = held[i - first, j - first]
         hold_latency(x, p)
-    return outcome, 0, x
+    return outcome, mark, x
 
 
 def _innovation_covariance(H: Array, PHt: Array, R: Array, scale: float, m: int) -> Array:
@@ -425,12 +430,14 @@ def _advance(
             clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, heave, span, chain
         )
         if ints[i, KIND] == HEAVE_MODEL:
+            ints[i, OUTCOME] = _FUSED
+            if (ints[i, STAMP_NS] - clock[2]) * 1e-9 < scatter[3]:
+                continue
             motion = np.empty(MOTION_SIZE)
             motion[0] = floats[i, OWN]
             motion[1:HEAVE_PARAMETERS] = floats[i, VALUE:OWN]
             motion[HEAVE_PARAMETERS:] = floats[i, OWN + 1 : OWN + 5]
             change_motion(state, P, heave, motion, offsets, chain)
-            ints[i, OUTCOME] = _FUSED
             continue
         if i < following:
             gyro = interpolate(imu0, clock[1], imu, t_imu, t)[:3]
@@ -439,10 +446,10 @@ def _advance(
                 x_before, P_before = state, P.copy()
             ints[i, OUTCOME], ints[i, RESET], state = _fuse(
                 state, P, memory[ints[i, SENSOR]], scatter, ints[i, KIND], floats[i, VALUE:OWN],
-                floats[i, OWN:RESULT], gyro, t_s, ints[i, LATE], p, offsets, H, floats[i, RESULT:],
+                floats[i, OWN:RESULT], gyro, t_s, ints[i, LATE], p, offsets, heave, H, floats[i, RESULT:],
             )  # fmt: skip
             if recording and ints[i, OUTCOME] <= _DOWNWEIGHTED:
-                if ints[i, RESET]:
+                if ints[i, RESET] == 1:
                     _open(t, state, P, heave, trail_count, trail_t, trail_marks, trail_x, trail_P, trail_chain,
                           trail_heave)  # fmt: skip
                     trail_marks[trail_count[0] - 1, RESET_KIND] = ints[i, KIND]
@@ -453,6 +460,10 @@ def _advance(
                           trail_chain, trail_heave)  # fmt: skip
                 trail_x[trail_count[0] - 1, AFTER] = state
                 trail_P[trail_count[0] - 1, AFTER] = P
+            if ints[i, RESET] == LET_GO:
+                if recording:
+                    chain = trail_chain[trail_count[0]]
+                let_go(t_s, state, P, memory[ints[i, SENSOR]], scatter, heave, p, offsets, chain)
             continue
         scatter_update(scatter, imu0, imu, (t - clock[1]) * 1e-9)
         new_period = period_ns == 0 or t // period_ns != clock[1] // period_ns
@@ -480,7 +491,7 @@ def _advance(
     return count
 
 
-_SOURCES = (deck, frames, models, parameters, rows_module, state, trail_module, update)
+_SOURCES = (deck, frames, models, parameters, rows_module, state, trail_module, update, watch)
 _kernel = jitted(_advance, [Path(inspect.getfile(m)) for m in _SOURCES] + [Path(__file__)])
 
 

@@ -119,7 +119,7 @@ class GpsConfig(_Table, frozen=True):
     ] = 0.1
     height_sigma_m: Annotated[
         float, _positive("white vertical noise where the receiver states none, and its floor", "m")
-    ] = 3.0
+    ] = 1.0
     velocity_sigma_mps: Annotated[
         float, _positive("white horizontal velocity noise where none is stated, and its floor", "m/s")
     ] = 0.2
@@ -141,10 +141,13 @@ class GpsConfig(_Table, frozen=True):
         0.7
     )
     height_bias_sigma_m: Annotated[
-        float, _positive("stationary 1-sigma of the vertical position error", "m")
+        float, _positive("1-sigma of the vertical position error at start", "m")
     ] = 4.0
     bias_time_s: Annotated[float, _positive("correlation time of the horizontal error", "s")] = 120.0
-    height_bias_time_s: Annotated[float, _positive("correlation time of the vertical error", "s")] = 3000.0
+    height_bias_walk: Annotated[
+        float,
+        _not_negative("random walk of the vertical error; 0.1: 0.1 m after 1 s, 0.3 m after 10 s", "m/rts"),
+    ] = 0.1
     max_accuracy_m: Annotated[
         float, _positive("a fix that states a worse horizontal accuracy is not used", "m")
     ] = 50.0
@@ -264,7 +267,12 @@ class VisionConfig(_Table, frozen=True):
 class PlatformConfig(_Table, frozen=True):
     """The floating platform: an anchored place, sway about it, a level, and heave."""
 
-    use: Annotated[bool, _choice("carry the platform's states; needs vision fixes")] = False
+    use: Annotated[
+        bool | Literal["auto"],
+        _choice(
+            "carry the platform's states; 'auto': where the log holds vision fixes, or a camera is flown"
+        ),
+    ] = "auto"
     offset_walk: Annotated[
         float, _not_negative("random walk of the mean place; 0.01: 0.03 m after 10 s", "m/rts")
     ] = 0.01
@@ -278,8 +286,11 @@ class PlatformConfig(_Table, frozen=True):
     sway_period_s: Annotated[float, _positive("period of the sway", "s")] = 6.0
     sway_damping: Annotated[float, _positive("damping ratio of the sway", "-")] = 0.3
     level_walk: Annotated[
-        float, _not_negative("random walk of the mean height (tide, drift); 0.01: 0.03 m after 10 s", "m/rts")
-    ] = 0.01
+        float,
+        _not_negative(
+            "random walk of the mean height (tide, load); 0.002: 2 mm after 1 s, 6 mm after 10 s", "m/rts"
+        ),
+    ] = 0.002
     heave_sigma_m: Annotated[
         float, _positive("stationary 1-sigma of the heave before it is learned", "m")
     ] = 0.3

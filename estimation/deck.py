@@ -359,15 +359,20 @@ def vision(
     return 3
 
 
+def camera_to_ned(x: Array, p: Array) -> Array:
+    """Return the rotation (3, 3) of the camera, with its mounting as estimated, to NED."""
+    R_cb = p[par.VISION_MOUNT : par.VISION_MOUNT + 9].copy().reshape(3, 3)
+    R_cm = compose(R_cb, quat_to_matrix(quat_exp(x[CM0 : CM0 + 3])).T.copy())
+    return compose(quat_to_matrix(x[Q0 : Q0 + 4]), R_cm.T.copy())
+
+
 def seen_place(r: Array, R: Array, x: Array, p: Array, seen: Array) -> None:
     """Write into ``seen`` (6,) where a fix with innovation ``r`` and covariance ``R`` shows the deck: its height,
     north and east [m], each followed by its variance.
 
     The vehicle's own position is taken as it is: its error is slow and belongs to level and place.
     """
-    R_cb = p[par.VISION_MOUNT : par.VISION_MOUNT + 9].copy().reshape(3, 3)
-    R_cm = compose(R_cb, quat_to_matrix(quat_exp(x[CM0 : CM0 + 3])).T.copy())
-    R_nc = compose(quat_to_matrix(x[Q0 : Q0 + 4]), R_cm.T.copy())
+    R_nc = camera_to_ned(x, p)
     for axis in range(3):
         row = (axis + 2) % 3
         shift = 0.0

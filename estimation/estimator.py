@@ -112,7 +112,7 @@ class LandingEstimator:
         self._clocks = ClockBank(AUTOPILOT)
         self._period_ns = round(1e9 / c.filter.output_rate_hz) if c.filter.output_rate_hz else 0
         self._latency = np.round(latencies_s(c, self.facts) * 1e9)
-        if c.platform.use and c.platform.learn_s > 0.0:
+        if c.platform.use is True and c.platform.learn_s > 0.0:
             self._learner = MotionLearner(
                 c.platform.learn_s, c.platform.learn_window_s, prior_motion(c.platform)
             )
@@ -422,6 +422,7 @@ class LandingEstimator:
             row = Rows.empty(1)
             row.t_ns[0] = due_ns + self._history.window_ns + TAKE_UP_NS
             row.kind[0] = HEAVE_MODEL
+            row.stamp_ns[0] = due_ns
             row.own[0, 0], row.value[0] = parameters[0], parameters[1:HEAVE_PARAMETERS]
             row.own[0, 1:5] = parameters[HEAVE_PARAMETERS:]
             row.id[0] = -1

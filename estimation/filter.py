@@ -21,6 +21,7 @@ from estimation.outcome import Outcome
 from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
 from estimation.state import ATTITUDE, PL0, Layout, plus
 from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
+from estimation.watch import LET_GO, let_go, unexplained
 
 if TYPE_CHECKING:
     from filterpy.kalman import ExtendedKalmanFilter
@@ -81,10 +82,12 @@ class FilterPyEngine:
             t = int(rows.t_ns[i])
             self._propagate(t, t_imu, imu)
             if rows.kind[i] == HEAVE_MODEL:
+                rows.outcome[i] = Outcome.FUSED
+                if (int(rows.stamp_ns[i]) - int(s.clock[2])) * 1e-9 < s.scatter[3]:
+                    continue
                 motion = np.concatenate((rows.own[i, :1], rows.value[i], rows.own[i, 1:5]))
                 chain = self.trail.chain[self.trail.count[0]] if self.trail.on else np.empty((0, 0))
                 change_motion(s.x, s.P, s.heave, motion, self.layout.offsets, chain)
-                rows.outcome[i] = Outcome.FUSED
                 continue
             if i < following:
                 gyro = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, t)[:3]
@@ -92,6 +95,8 @@ class FilterPyEngine:
                 self._fuse(rows, i, gyro)
                 if self.trail.on:
                     self._record(rows, i, x, P)
+                if rows.reset[i] == LET_GO:
+                    self._let_go(rows, i)
                 continue
             update.scatter_update(s.scatter, s.imu, imu, (t - int(s.clock[1])) * 1e-9)
             new_period = period_ns == 0 or t // period_ns != int(s.clock[1]) // period_ns
@@ -165,6 +170,8 @@ class FilterPyEngine:
         if kind == models.VISION:
             seen_place(r, R, s.x, self.p, rows.seen[i])
         w = update.weight(nis, m, self.p)
+        if kind == models.VISION and unexplained(memory, t_s, r, S, w, s.x, self.p, s.heave):
+            rows.reset[i] = LET_GO
         if w == 0.0:
             rows.outcome[i] = Outcome.REJECTED_GATE
             if update.locked_out(memory, kind, t_s, r, R, m, self.p):
@@ -197,12 +204,19 @@ class FilterPyEngine:
             update.hold_latency(s.x, self.p)
         s.P = 0.5 * (P + P.T)
 
+    def _let_go(self, rows: Rows, i: int) -> None:
+        s = self.state
+        t_s = (int(rows.t_ns[i]) - int(s.clock[2])) * 1e-9
+        chain = self.trail.chain[self.trail.count[0]] if self.trail.on else np.empty((0, 0))
+        memory = s.memory[rows.sensor[i]]
+        let_go(t_s, s.x, s.P, memory, s.scatter, s.heave, self.p, self.layout.offsets, chain)
+
     def _record(self, rows: Rows, i: int, x: Array, P: Array) -> None:
         """Note a measurement that was fused, with the state before it."""
         s, trail = self.state, self.trail
         if rows.outcome[i] > Outcome.DOWNWEIGHTED:
             return
-        if rows.reset[i]:
+        if rows.reset[i] == 1:
             trail.open(int(rows.t_ns[i]), s.x, s.P, s.heave)
             trail.marks[trail.count[0] - 1, RESET_KIND] = rows.kind[i]
             trail.marks[trail.count[0] - 1, RESET_SIZE] = int(rows.result[i, 1])

@@ -26,6 +26,7 @@ from estimation.heave.bandpass import BandPass
 from estimation.heave.model import HeaveModel, fit
 from estimation.outcome import Outcome
 from estimation.rows import Rows
+from estimation.watch import LET_GO
 
 LEAST_S = 8.0
 """Shortest observation that a spectrum is learned from [s]."""
@@ -34,6 +35,8 @@ LEAST_SKILL = 0.5
 motion that is foreseen worse only size and speed are."""
 SETTLING_S, GAP_S = 6.0, 2.0
 """So long after the first fix, and after a gap of the second length, the level is still finding its place [s]."""
+BEFORE_S = 3.0
+"""Of the time before a learned heave was let go, so much belongs to what came then [s]."""
 SWAY_S = 16.0
 """Shortest observation that the sway is learned from [s]."""
 SWAY_EVERY = 5
@@ -64,6 +67,7 @@ class MotionLearner:
     _seen: list[list[float]] = field(default_factory=list)
     _due_ns: int | None = None
     _settled_ns: int = 0
+    _begin_ns: int | None = None
     _count: int = 0
     _prior: Array = field(init=False)
 
@@ -97,6 +101,10 @@ class MotionLearner:
         return results
 
     def _keep(self, rows: Rows) -> None:
+        for i in np.flatnonzero(rows.reset == LET_GO):
+            self._begin_ns = int(rows.t_ns[i]) - int(BEFORE_S * 1e9)
+            self.model = self.block = None
+            self.parameters[:HEAVE_PARAMETERS] = self._prior[:HEAVE_PARAMETERS]
         for t_ns, seen in zip(rows.t_ns.tolist(), rows.seen.tolist(), strict=True):
             if not self._t_ns or t_ns - self._t_ns[-1] > GAP_S * 1e9:
                 self._settled_ns = t_ns + int(SETTLING_S * 1e9)
@@ -125,8 +133,12 @@ class MotionLearner:
             return None
         t = (np.array(self._t_ns) - self._due_ns) * 1e-9
         seen = np.array(self._seen)
-        height = seen[:, 0] - self._drift(seen[:, 6])
-        self.model = fit(t, height, np.sqrt(seen[:, 1]), window_s=self.window_s, previous=self.model)
+        now = slice(0 if self._begin_ns is None else int(np.searchsorted(self._t_ns, self._begin_ns)), None)
+        if len(t[now]) < 2 or t[-1] - t[now][0] < LEAST_S:
+            return None
+        height = seen[now, 0] - self._drift(seen[now, 6])
+        sigma = np.sqrt(seen[now, 1])
+        self.model = fit(t[now], height, sigma, window_s=self.window_s, previous=self.model)
         if self.model.method == "bhr":
             self._take_heave(self.model)
         if t[-1] - t[0] >= SWAY_S:

@@ -11,6 +11,7 @@ from estimation.events import Kind, Names
 from estimation.outcome import Outcome
 from estimation.output import RECORD_DTYPE
 from estimation.rows import HEAVE_MODEL, PENDING, Rows
+from estimation.watch import LET_GO
 
 
 @dataclass(slots=True)
@@ -71,6 +72,9 @@ class Ledger:
         records["log_det"] = np.where(r.result[:, 1] > 0, r.log_det, np.nan)
         records["age_s"] = r.age_ns * 1e-9
         for i in np.flatnonzero(r.reset):
+            if r.reset[i] == LET_GO:
+                self.note(int(r.t_ns[i]), "the deck no longer moves as was learned: its heave is open again")
+                continue
             name, size = names.sensors[int(r.sensor[i])], float(np.linalg.norm(r.result[i, 2:5]))
             text = f"{name} contradicted the filter, but not itself, for long: moved onto it by {size:.1f}"
             self.note(int(r.t_ns[i]), text)

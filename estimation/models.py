@@ -157,15 +157,15 @@ def transition(
         Q[bg + i, bg + i] = p[par.GYRO_BIAS_WALK] ** 2 * dt
         Q[ba + i, ba + i] = p[par.ACCEL_BIAS_WALK] ** 2 * dt
     if offsets[GPS_BIAS] >= 0:
-        # First-order Gauss-Markov, exact for any dt.
+        # First-order Gauss-Markov, exact for any dt; that of the height has no mean to come back to: how it wanders
+        # says nothing of how far it is off.
         b = offsets[GPS_BIAS]
-        for i in range(3):
-            time = p[par.GPS_BIAS_TIME_V] if i == 2 else p[par.GPS_BIAS_TIME]
-            sigma = p[par.GPS_BIAS_V] if i == 2 else p[par.GPS_BIAS_H]
-            decay = math.exp(-dt / time)
+        decay = math.exp(-dt / p[par.GPS_BIAS_TIME])
+        for i in range(2):
             y[BP0 + i] *= decay
             F[b + i, b + i] = decay
-            Q[b + i, b + i] = sigma**2 * (1.0 - decay * decay)
+            Q[b + i, b + i] = p[par.GPS_BIAS_H] ** 2 * (1.0 - decay * decay)
+        Q[b + 2, b + 2] = p[par.GPS_BIAS_WALK_V] ** 2 * dt
     if offsets[BARO_BIAS] >= 0:
         b = offsets[BARO_BIAS]
         Q[b, b] = p[par.BARO_BIAS_WALK] ** 2 * dt

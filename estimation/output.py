@@ -42,21 +42,33 @@ class Facts:
     """What the source of the events knows beforehand, used where the configuration leaves it open.
 
     ``imu_latency_s`` is the age of an inertial sample at its stamp (filter delay); ``declination_rad`` is east
-    positive; ``vision_by_arrival`` says that vision fixes have no stamps of their own but those of their arrival.
+    positive; ``vision_by_arrival`` says that vision fixes have no stamps of their own but those of their arrival,
+    ``vision`` that there are, or will be, vision fixes at all.
     """
 
     imu_latency_s: float = 0.0
     declination_rad: float | None = None
     vision_by_arrival: bool = False
+    vision: bool = False
 
 
 def with_facts(config: Config, facts: Facts) -> Config:
-    """Return the configuration as it applies: fixes that are stamped with their arrival have the age of that."""
+    """Return the configuration as it applies: the platform's states are on or off, and fixes that are stamped with
+    their arrival have the age of that.
+    """
+    config = with_platform(config, facts.vision)
     if not facts.vision_by_arrival:
         return config
     v = config.vision
     age = {"latency_s": v.arrival_latency_s, "latency_sigma_s": v.arrival_latency_sigma_s}
     return replace(config, vision=replace(v, **age))
+
+
+def with_platform(config: Config, vision: bool) -> Config:
+    """Return the configuration with the platform's ``use``, where it is ``auto``, as there are vision fixes or not."""
+    if config.platform.use != "auto":
+        return config
+    return replace(config, platform=replace(config.platform, use=vision))
 
 
 @dataclass(frozen=True, slots=True)

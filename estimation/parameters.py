@@ -34,7 +34,7 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     GPS_BIAS_H,
     GPS_BIAS_V,
     GPS_BIAS_TIME,
-    GPS_BIAS_TIME_V,
+    GPS_BIAS_WALK_V,
     GPS_MAX_ACCURACY,
     GPS_RTK_ACCURACY,
     GPS_RESET_AFTER,
@@ -80,8 +80,15 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     LATENCY,
     SWAY_ZETA,
     LEVEL_WALK,
+    PRIOR_HEAVE,
+    _,
+    _,
+    _,
+    _,
+    _,
+    _,
     SIZE,
-) = range(67)
+) = range(74)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +119,7 @@ def pack_parameters(config: Config, site: Site) -> Array:
     p[GPS_BIAS_H], p[GPS_BIAS_V] = c.gps.bias_sigma_m, c.gps.height_bias_sigma_m
     p[GPS_BIAS_TIME], p[GPS_MAX_ACCURACY] = c.gps.bias_time_s, c.gps.max_accuracy_m
     p[GPS_RTK_ACCURACY] = c.gps.rtk_accuracy_m
-    p[GPS_BIAS_TIME_V] = c.gps.height_bias_time_s
+    p[GPS_BIAS_WALK_V] = c.gps.height_bias_walk
     p[GPS_RESET_AFTER] = c.gps.reset_after_s
     p[BARO_USE], p[BARO_SIGMA], p[BARO_BIAS_WALK] = (
         c.barometer.use,
@@ -134,6 +141,10 @@ def pack_parameters(config: Config, site: Site) -> Array:
     p[VISION_MOUNT : VISION_MOUNT + 9] = (R_CB_NOMINAL @ mount.T).ravel()
     p[LATENCY_WALK], p[LATENCY_RATE], p[LATENCY] = v.latency_walk, v.latency_rate_radps, v.latency_s
     p[SWAY_ZETA], p[LEVEL_WALK] = d.sway_damping, d.level_walk
+    if d.use is True:
+        from estimation.deck import prior_motion
+
+        p[PRIOR_HEAVE:SIZE] = prior_motion(d)[: SIZE - PRIOR_HEAVE]
     for dof in (1, 2, 3):
         p[HUBER_1 + dof - 1] = chi_square_bound(c.filter.huber_sigma, dof)
         p[GATE_1 + dof - 1] = chi_square_bound(c.filter.gate_sigma, dof)

@@ -35,7 +35,8 @@ class Rows:
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
     the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
     the inertial clock was past the content when it arrived. ``value`` and ``own`` (n, 6) are the event's value and
-    covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved) and ``result`` (n, 8):
+    covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved, 2 where the learned
+    heave was let go) and ``result`` (n, 8):
     NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 7): where a fix shows the deck
     (``estimation.deck.seen_place``) and the level after it was fused [m], and ``log_det``: logarithm of the determinant
     of the innovation's covariance.
@@ -102,7 +103,7 @@ class Rows:
 
     @property
     def reset(self) -> Int:
-        """1 where a lock-out was resolved."""
+        """1 where a lock-out was resolved, 2 where the learned heave was let go."""
         return self.ints[:, RESET]
 
     @property
@@ -200,8 +201,9 @@ class FilterState:
     """Everything that the next step depends on; copied, it is a checkpoint.
 
     ``clock`` holds the state's time, the last inertial sample's and the start's [ns]; ``imu`` that sample;
-    ``scatter`` the vibration measure and the mean squared rotation; ``memory`` what is remembered of each sensor;
-    ``heave`` the parameters of the deck's motion (``estimation.deck``).
+    ``scatter`` the vibration measure (2), the mean squared rotation and when a learned heave was last let go [s since
+    the start]; ``memory`` what is remembered of each sensor; ``heave`` the parameters of the deck's motion
+    (``estimation.deck``).
     """
 
     clock: Int

@@ -91,7 +91,7 @@ class Layout:
             on.append(GPS_BIAS)
         if config.barometer.use:
             on.append(BARO_BIAS)
-        if config.platform.use:
+        if config.platform.use is True:
             on.extend(DECK_BLOCKS)
         return cls.with_blocks(on)
 

@@ -114,7 +114,10 @@ class SimulatedFlight:
     @property
     def facts(self) -> Facts:
         """What the log of this flight says about its sensors."""
-        return Facts(imu_latency_s=self.scenario.drawn.imu.latency_s or 0.0)
+        return Facts(
+            imu_latency_s=self.scenario.drawn.imu.latency_s or 0.0,
+            vision=self.scenario.streams.vision is not None,
+        )
 
     def recording(self) -> Recording:
         """Return the flight as a recording: sensors, truth, the filter's configuration and how it was made."""

@@ -27,7 +27,7 @@ from simulation.sensors import (
     Stream,
     Streams,
     VisionStream,
-    gauss_markov,
+    gps_wander,
     sample_times,
     standard_pressure,
 )
@@ -229,10 +229,7 @@ class Instruments:
         error = sigma * rng.standard_normal((len(t), 3))
         if c.bias:
             wander = np.array([c.bias_sigma_m, c.bias_sigma_m, c.height_bias_sigma_m])
-            time = np.array([c.bias_time_s, c.bias_time_s, c.height_bias_time_s])
-            self.slow["gps_bias"] = SlowError(
-                t, gauss_markov(len(t), 1.0 / stream.rate_hz, wander, time, rng)
-            )
+            self.slow["gps_bias"] = SlowError(t, gps_wander(c, len(t), 1.0 / stream.rate_hz, rng))
             error += self.slow["gps_bias"].values
         speed_sigma = np.array([c.velocity_sigma_mps, c.velocity_sigma_mps, c.climb_sigma_mps])
         speed_error = speed_sigma * rng.standard_normal((len(t), 3))

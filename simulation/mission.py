@@ -109,8 +109,8 @@ def parse_mission(text: str, source: str = "mission") -> Mission:
         waves_of(mission.sea)
     except ValueError as error:
         raise ConfigError(f"{source}: {error}") from None
-    if mission.streams.vision is None or not config.platform.use:
+    if mission.streams.vision is None or config.platform.use is False:
         raise ConfigError(
-            f"{source}: a landing needs vision; give [streams.vision] and filter.platform.use = true"
+            f"{source}: a landing needs vision; give [streams.vision] and no filter.platform.use = false"
         )
     return mission

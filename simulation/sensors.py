@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.config import Config
+from estimation.config import Config, GpsConfig
 from estimation.events import AUTOPILOT, CAMERA, COMPANION, EVENT_DTYPE, EventBatch, Kind
 from estimation.frames import ned_to_geodetic, quat_exp, quat_multiply
 from simulation.fixes import CameraErrors, View, draw_fixes
@@ -218,12 +218,11 @@ class Sensors:
         m = trajectory.motion(t)
         lever = np.array(c.lever_arm_m)
         sigma = np.array([c.position_sigma_m, c.position_sigma_m, c.height_sigma_m])
-        wander = np.zeros(3)
         position = m.position_m + m.R_nb @ lever + sigma * rng.standard_normal((n, 3))
+        wander = np.zeros(3)
         if c.bias:
             wander = np.array([c.bias_sigma_m, c.bias_sigma_m, c.height_bias_sigma_m])
-            time = np.array([c.bias_time_s, c.bias_time_s, c.height_bias_time_s])
-            slow["gps_bias"] = SlowError(t, gauss_markov(n, 1.0 / stream.rate_hz, wander, time, rng))
+            slow["gps_bias"] = SlowError(t, gps_wander(c, n, 1.0 / stream.rate_hz, rng))
             position += slow["gps_bias"].values
         place = np.array([ned_to_geodetic(p, self.place.origin) for p in position]).reshape(-1, 3)
         swing = np.cross(m.angular_velocity_radps, lever)
@@ -351,6 +350,14 @@ class Sensors:
         if there is not None:
             kept &= there
         return EventBatch(rows[kept], (name,), CLOCKS)
+
+
+def gps_wander(config: GpsConfig, n: int, dt_s: float, rng: np.random.Generator) -> Array:
+    """Return n samples (n, 3) of a receiver's slow error, NED [m]: horizontally with a mean, in height without."""
+    across = gauss_markov(n, dt_s, np.full(2, config.bias_sigma_m), np.full(2, config.bias_time_s), rng)
+    steps = config.height_bias_walk * math.sqrt(dt_s) * rng.standard_normal(n)
+    steps[:1] = config.height_bias_sigma_m * rng.standard_normal()
+    return np.column_stack([across, np.cumsum(steps)])
 
 
 def gauss_markov(n: int, dt_s: float, sigma: Array, time_s: Array, rng: np.random.Generator) -> Array:

@@ -147,7 +147,7 @@ def fly(
 
 def facts_of(mission: Mission) -> Facts:
     """Return what the autopilot of a mission tells of its sensors."""
-    return Facts(imu_latency_s=mission.drawn.imu.latency_s or 0.0)
+    return Facts(imu_latency_s=mission.drawn.imu.latency_s or 0.0, vision=True)
 
 
 @dataclass(slots=True)

@@ -79,7 +79,7 @@ def test_the_log_of_a_mission_is_an_ordinary_flight(tmp_path: Path) -> None:
     ("text", "word"),
     [
         ('description = "x"\n', "closed_loop"),
-        ('description = "x"\nclosed_loop = true\n', "platform.use"),
+        ('description = "x"\nclosed_loop = true\n[filter.platform]\nuse = false\n', "platform.use"),
         ('description = "x"\nclosed_loop = true\nwinds = 3\n', "winds"),
         ('description = "x"\nclosed_loop = true\nmishaps = [{kind = "meteor", start_s = 1.0}]\n', "meteor"),
         ("description = \n", "TOML"),
