@@ -294,8 +294,13 @@ class PlatformConfig(_Table, frozen=True):
     heave_sigma_m: Annotated[
         float, _positive("stationary 1-sigma of the heave before it is learned", "m")
     ] = 0.3
-    heave_period_s: Annotated[float, _positive("period of the heave before it is learned", "s")] = 6.0
-    heave_damping: Annotated[float, _positive("damping of the heave before it is learned", "-")] = 0.4
+    heave_period_s: Annotated[
+        float,
+        _positive(
+            "middle period of the heave before it is learned; seas from half to twice it are expected", "s"
+        ),
+    ] = 6.0
+    heave_damping: Annotated[float, _positive("damping of the heave before it is learned", "-")] = 0.5
     learn_s: Annotated[
         float, _not_negative("interval at which the heave's spectrum is learned anew; 0: never", "s")
     ] = 2.0

@@ -46,6 +46,9 @@ HEAVE_SIZE = 6
 HEAVE_PARAMETERS = 7
 SWAY_NORTH, SWAY_EAST, SWAY_OMEGA, OFFSET_WALK = 7, 8, 9, 10
 MOTION_SIZE = 11
+ANY_SEA = np.array([1.0 / 1.6, 1.0, 1.6])
+"""Frequencies of the sections of a heave without a form of its own, over their middle: with a damping of 0.5, short
+wind sea and swell both lie within what it expects."""
 DRIFT_TIME_S = 3.0
 """After so long a random walk of the place is as far as the steady velocity that it stands for takes it [s]."""
 OUTPUT_SIZE = 8
@@ -76,9 +79,9 @@ def heave_stationary(heave: Array) -> Array:
 
 
 def prior_motion(platform: PlatformConfig) -> Array:
-    """Return the parameters of the motion (11,) before it is learned."""
+    """Return the parameters of the motion (11,) before it is learned: a heave of any sea, spread about a period."""
     omega = 2.0 * math.pi / platform.heave_period_s
-    heave = np.array([1.0, omega, omega, omega, *[platform.heave_damping] * 3])
+    heave = np.array([1.0, *(omega * ANY_SEA), *[platform.heave_damping] * 3])
     heave[0] = platform.heave_sigma_m / math.sqrt(heave_stationary(heave)[5, 5])
     sway = platform.sway_sigma_m
     return np.array([*heave, sway, sway, 2.0 * math.pi / platform.sway_period_s, platform.offset_walk])

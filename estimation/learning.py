@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from estimation.deck import (
+    ANY_SEA,
     DRIFT_TIME_S,
     HEAVE_PARAMETERS,
     OFFSET_WALK,
@@ -179,15 +180,15 @@ class MotionLearner:
 
 
 def broad_heave(sigma_m: float, rate_mps: float, damping: float) -> Array:
-    """Return the heave's parameters (7,) of three equal sections of this damping that heave, and heave at a rate,
-    with these standard deviations (the rate within what seas have).
+    """Return the heave's parameters (7,) of any sea's form, with this damping, that heaves, and heaves at a rate, with
+    these standard deviations (the rate within what seas have).
     """
-    unit = np.array([1.0, 1.0, 1.0, 1.0, damping, damping, damping])
+    unit = np.array([1.0, *ANY_SEA, damping, damping, damping])
     stationary, row = heave_stationary(unit), heave_matrix(unit)[5]
     per_omega = math.sqrt(float(row @ stationary @ row / stationary[5, 5]))
     sigma = max(sigma_m, STILL_M)
     omega = _in_sea(rate_mps / (sigma * per_omega))
-    unit[1:4] = omega
+    unit[1:4] *= omega
     unit[0] = sigma / math.sqrt(heave_stationary(unit)[5, 5])
     return unit
 

@@ -141,7 +141,7 @@ def test_both_engines_let_go_at_the_same_fix(monkeypatch: pytest.MonkeyPatch) ->
     pytest.importorskip("numba", reason="the compiled engine needs numba")
     still = prior_motion(CONFIG.platform)
     still[0] *= 0.05
-    dues = [BOOT + int(s * 1e9) for s in (12.0, STILL_S + 1.0)]
+    dues = [BOOT + int(s * 1e9) for s in (12.0, STILL_S + 0.5)]
 
     def take(self: MotionLearner, settled: Rows) -> list[tuple[int, HeaveModel | None, Array]]:
         return [(due, None, still) for due in dues if settled.t_ns[0] <= due < settled.t_ns[-1]]
