@@ -57,6 +57,21 @@ def _unknown(upper: F64) -> F64:
     return np.where((upper == 0.0).all(axis=1, keepdims=True), np.nan, upper)
 
 
+def _upper_of(covariance: F64) -> F64:
+    """Return the upper triangles (n, 6) of the first 3x3 blocks of 6x6 matrices (n, 36); NaN where all is zero.
+
+    A block that is not symmetric (to single precision) is no covariance: it gets a variance below zero, which is
+    rejected as that, instead of half of it being believed.
+    """
+    block = covariance[:, _BLOCK].reshape(-1, 3, 3)
+    upper = _unknown(covariance[:, _BLOCK][:, _UPPER])
+    size = np.abs(block).max(axis=(1, 2))
+    with np.errstate(invalid="ignore"):
+        lopsided = np.abs(block - block.transpose(0, 2, 1)).max(axis=(1, 2)) > 1e-6 * size
+    upper[lopsided, 0] = -1.0
+    return upper
+
+
 def _write_imu(rows: NDArray[np.void]) -> NDArray[np.void]:
     data = new_rows("/imu", len(rows))
     data["orientation"][:, 3] = 1.0
@@ -127,7 +142,7 @@ def _write_velocity(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 def _read_velocity(one: Series, rows: NDArray[np.void], everything: Sequence[Series]) -> None:
     rows["value"][:, :3] = one.data["twist_twist_linear"]
-    rows["covariance"] = _unknown(one.data["twist_covariance"][:, _BLOCK][:, _UPPER])
+    rows["covariance"] = _upper_of(one.data["twist_covariance"])
     stated = one.metadata.get("fix_type", "")
     if stated.isdecimal():
         rows["value"][:, 3] = float(stated)
@@ -218,7 +233,7 @@ def _write_vision(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 def _read_vision(one: Series, rows: NDArray[np.void], _all: Sequence[Series]) -> None:
     rows["value"][:, :3] = one.data["pose_pose_position"]
-    rows["covariance"] = _unknown(one.data["pose_covariance"][:, _BLOCK][:, _UPPER])
+    rows["covariance"] = _upper_of(one.data["pose_covariance"])
 
 
 def _write_user(rows: NDArray[np.void]) -> NDArray[np.void]:

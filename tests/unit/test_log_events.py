@@ -6,6 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.events import GpsPosition, GpsVelocity, Rangefinder
+from estimation.outcome import Outcome
+from estimation.rows import PENDING, Rows
+from estimation.screening import malformed
 from logs.event_columns import FOREIGN
 from logs.events import as_logged, events_of_series
 from logs.recording import Series
@@ -62,6 +65,24 @@ def test_covariance_of_a_fix_is_turned_from_enu_to_ned() -> None:
     assert unknown.covariance_ned_m2 is None
     assert isinstance(diagonal, GpsPosition)
     assert diagonal.covariance_ned_m2 is not None
+
+
+def test_a_covariance_that_is_not_symmetric_is_rejected_as_none() -> None:
+    data = new_rows("/vision/fix", 3)
+    data["pose_pose_position"] = [1.0, 2.0, 8.0]
+    block = np.zeros((3, 6, 6))
+    block[:, :3, :3] = np.diag([0.01, 0.02, 0.03])
+    block[1, 0, 2] = 0.004
+    block[2] = 0.0
+    data["pose_covariance"] = block.reshape(3, 36)
+    batch = events_of_series([Series("/vision/fix", STAMPS, STAMPS + 5, data, clock="autopilot")])
+    rows = Rows.empty(3)
+    rows.kind[:], rows.value[:], rows.own[:] = (
+        batch.rows["kind"],
+        batch.rows["value"],
+        batch.rows["covariance"],
+    )
+    assert malformed(rows).tolist() == [PENDING, Outcome.REJECTED_COVARIANCE, PENDING]
 
 
 def test_a_range_is_logged_in_single_precision_and_stays_there() -> None:
