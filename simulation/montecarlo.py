@@ -104,7 +104,7 @@ def parts_at(flight: SimulatedFlight, t_s: Array) -> Times:
     """Return the part of the flight, as an index of ``PARTS``, at each time."""
     index = flight.trajectory.phase(t_s)
     vision = flight.scenario.streams.vision
-    if vision is None:
+    if vision is None or vision.view is None:
         return index
     begin, end = flight.trajectory.plan.bounds_s["hover"]
     seeing = max([b for a, b in vision.view.hidden_s if a < begin < b], default=begin)
