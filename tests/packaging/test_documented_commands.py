@@ -34,7 +34,7 @@ NOT_RUN = {
     ". .venv/bin/activate": "changes the reader's shell",
     "dask": "a cluster; tests/unit/test_fleet.py has one",
     "deckfix fleet logs/ -o results/ --scheduler": "a cluster; tests/unit/test_fleet.py has one",
-    "deckfix onboard": "flies until it is stopped; tests/unit/test_onboard.py flies it",
+    "deckfix onboard": "flies until it is stopped; tests/faults/test_onboard_faults.py starts it",
     "deckfix simulate landing_beaufort2_2026_11 --serve": "waits; tests/unit/test_served_vehicle.py has both",
     "deckfix tune": "takes minutes; tests/unit/test_tune.py runs it on small flights",
 }
