@@ -145,7 +145,7 @@ def _in_use(name: str, config: Config) -> bool:
     """Whether a parameter of the default list can be seen at all with this configuration."""
     table = name.split(".", maxsplit=1)[0]
     if table in ("platform", "vision"):
-        return config.platform.use is True
+        return config.platform.use is not False  # compared fixes say that 'auto' has switched it on
     if table in ("barometer", "magnetometer", "rangefinder"):
         return bool(getattr(config, table).use)
     if table == "attitude":

@@ -17,7 +17,7 @@ from deckfix.tune import STATE, TuneOptions, run_tune
 from deckfix.tune_objective import FAULTY, Refused, Score, Trial, density, score
 from deckfix.tune_parameters import DEFAULTS, choose, factor_in_words, with_values
 from deckfix.tune_search import Search
-from estimation.config import Config, dump_config, load_config
+from estimation.config import Config, dump_config, load_config, parse_config
 from estimation.events import Event, EventBatch, GpsVelocity, Kind
 from estimation.frames import Array
 from logs.events import series_of_batch
@@ -223,6 +223,10 @@ def test_defaults_are_numbers_of_the_configuration_that_the_sensors_there_tell_o
     names = {p.name for p in choose(Config(), [Kind.GPS_VELOCITY])[0]}
     assert "gps.velocity_sigma_mps" in names
     assert "gps.position_sigma_m" not in names
+    assert "vision.floor_m" not in names
+    assert "vision.floor_m" in {p.name for p in choose(Config(), [Kind.VISION])[0]}
+    without = parse_config("[platform]\nuse = false\n")
+    assert "vision.floor_m" not in {p.name for p in choose(without, [Kind.VISION])[0]}
     assert "attitude.tilt_sigma_rad" not in {
         p.name for p in choose(Config(), list(Kind))[0]
     }  # only starts from it
