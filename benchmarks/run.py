@@ -113,6 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.write_baselines and options.full:
         parser.error("--write-baselines: baselines are of the quick runs; leave out --full")
     # The matrices are small: threads of the linear algebra library only wait for each other.
+    os.environ.setdefault("PYTHONUNBUFFERED", "1")
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     lines, good = [], True
