@@ -389,8 +389,12 @@ class LandingConfig(_Table, frozen=True):
     ] = 0.4
     skill_horizon_s: Annotated[float, _positive("horizon at which the skill is judged", "s")] = 0.5
     hold_height_m: Annotated[
-        float, _positive("height above the deck at which a quiet moment is waited for", "m")
-    ] = 0.8
+        float,
+        _positive(
+            "height above the deck at which a quiet moment is waited for: the target stays in view inside r_land",
+            "m",
+        ),
+    ] = 1.2
     gear_m: Annotated[
         float,
         _not_negative("height of the inertial sensor above the deck when the vehicle stands on it", "m"),

@@ -3,7 +3,8 @@
     SEARCH       over the anchor, high enough to see the platform wherever it may be (3.1 to 3.4)
     TRACKING     over the target, down to the tracking altitude, inside r_track (3.5); heave is ignored
     OBSERVATION  there, until the deck's motion is foreseen with skill, is calm, or time is up (3.6)
-    LANDING      down to a height over the deck, wait there for a quiet moment, then down to contact (3.7)
+    LANDING      down to a height over the deck, wait there for a quiet moment, then down to contact (3.7); back to
+                 that height where the place is not good enough while the target is still in view, an abort below that
     ABORT        up and away from the deck; then the search begins anew, or the landing is given up
 
 Nothing is commanded here: a ``Decision`` holds the velocity that the vehicle should fly, and the reason for the mode,
@@ -308,10 +309,14 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
     if _tilt(e) > c.abort_tilt_rad:
         return _abort(p, Reason.TILTED, seen)
     inside = _inside(e, c.r_land_m)
-    fall_s = (c.hold_height_m - c.gear_m) / c.touchdown_rate_mps
+    fall_s = time_to_contact(c.hold_height_m, c)
     if p.descent_ns is not None:
-        if inside < c.abort_probability:
-            return _abort(p, Reason.OUTSIDE_R_LAND, seen)
+        # So near that the vehicle could not answer before it stands, it is not led up again for its place.
+        committed = height - c.gear_m < c.touchdown_rate_mps * c.response_s
+        if inside < c.abort_probability and not committed:
+            if height <= c.blind_height_m:
+                return _abort(p, Reason.OUTSIDE_R_LAND, seen)
+            return replace(p, descent_ns=None, met_ns=None, reason=Reason.OUTSIDE_R_LAND)
         if (seen.now_ns - p.descent_ns) * 1e-9 > LONGEST_DESCENT * fall_s:
             return _abort(p, Reason.NO_CONTACT, seen)
         return p
@@ -399,7 +404,7 @@ def _quiet(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -> floa
     """Return the probability of a quiet deck at the contact that a descent begun now would lead to."""
     if forecast is None:
         return 0.0
-    contact = max(0.0, -float(e.deck[2]) - c.gear_m) / c.touchdown_rate_mps
+    contact = time_to_contact(-float(e.deck[2]), c)
     return forecast.quiet_probability(
         contact - CONTACT_SPREAD_S, contact + CONTACT_SPREAD_S, c.quiet_rate_mps
     )
@@ -442,10 +447,29 @@ def _decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
         descent = min(c.approach_rate_mps, max(-c.climb_mps, wanted))
     else:
         aim = np.array([0.0, 0.0, -c.gear_m])
-        descent = c.touchdown_rate_mps
+        descent = descent_rate(height, c)
     velocity[2] = descent - deck_rate_ahead(e, seen.forecast, c.response_s)
     inside, quiet = _inside(e, c.r_land_m), _quiet(e, seen.forecast, c)
     return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.land_tilt_rad, aim, inside, quiet)
+
+
+def descent_rate(height_m: float, c: LandingConfig) -> float:
+    """Return the rate [m/s] relative to the deck of the last descent: that of the approach, slowing down to that of the
+    touchdown until the target need not be in view any more.
+    """
+    slowing = c.touchdown_rate_mps + c.position_gain * (height_m - c.blind_height_m)
+    return min(c.approach_rate_mps, max(c.touchdown_rate_mps, slowing))
+
+
+def time_to_contact(height_m: float, c: LandingConfig) -> float:
+    """Return how long [s] the last descent takes from a height over the deck."""
+    slow, fast, gain = c.touchdown_rate_mps, c.approach_rate_mps, c.position_gain
+    end = max(c.blind_height_m, c.gear_m)
+    begin = end + (fast - slow) / gain
+    time = max(0.0, min(height_m, end) - c.gear_m) / slow
+    if height_m > end:
+        time += math.log1p(gain * (min(height_m, begin) - end) / slow) / gain
+    return time + max(0.0, height_m - begin) / fast
 
 
 def deck_rate_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) -> float:

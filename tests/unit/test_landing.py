@@ -18,8 +18,10 @@ from estimation.landing import (
     Progress,
     Reason,
     Situation,
+    descent_rate,
     search_altitude_m,
     step,
+    time_to_contact,
 )
 from estimation.output import Estimate
 from estimation.state import NOMINAL_SIZE
@@ -103,7 +105,9 @@ def test_a_landing_goes_through_all_modes_in_order() -> None:
     assert p.descent_ns is None
     p, said = fly(p, 0.05, replace(hold, now_ns=p.since_ns + 10**9, forecast=forecast(0, 0.1)), c)
     assert (said.mode, said.reason) == (Mode.LANDING, Reason.DECK_QUIET)
-    assert said.velocity_mps[2] == pytest.approx(c.touchdown_rate_mps - 0.1)
+    assert said.velocity_mps[2] == pytest.approx(c.approach_rate_mps - 0.1)
+    low = Situation(p.since_ns, estimate(0, (0.05, 0.0, -0.4), 0.4), 0.1, forecast(0, 0.1))
+    assert fly(p, 0.05, low, c)[1].velocity_mps[2] == pytest.approx(c.touchdown_rate_mps - 0.1)
     p, said = fly(p, 0.05, replace(hold, now_ns=(p.descent_ns or 0) + 10**9, on_deck=True), c)
     assert (said.mode, said.reason) == (Mode.LANDED, Reason.CONTACT)
 
@@ -128,6 +132,31 @@ def test_a_descent_is_broken_off_when_it_must_be(seen: Situation, reason: Reason
     assert (said.mode, said.reason) == (Mode.ABORT, reason)
     assert said.velocity_mps[2] == -LandingConfig().climb_mps
     assert p.attempts == 1
+
+
+def test_above_the_blind_height_the_place_is_corrected_and_the_quiet_moment_waited_for_anew() -> None:
+    seen = Situation(10**9, estimate(10**9, (0.6, 0.0, -0.8)), 0.1)
+    p, said = step(landing(), seen, LandingConfig())
+    assert (said.mode, said.reason) == (Mode.LANDING, Reason.OUTSIDE_R_LAND)
+    assert p.descent_ns is None
+    assert said.velocity_mps[2] < 0.0
+
+
+def test_what_stands_before_it_could_be_led_up_stays() -> None:
+    seen = Situation(10**9, estimate(10**9, (0.6, 0.0, -0.12)), 0.1)
+    p, said = step(landing(), seen, LandingConfig())
+    assert said.mode is Mode.LANDING
+    assert p.descent_ns is not None
+
+
+def test_the_time_to_contact_is_that_of_the_descent() -> None:
+    c = LandingConfig()
+    for height in (0.05, 0.3, 0.6, 1.2, 3.0):
+        h, t = height, 0.0
+        while h > c.gear_m:
+            h -= 1e-3 * descent_rate(h, c)
+            t += 1e-3
+        assert time_to_contact(height, c) == pytest.approx(t, abs=0.01)
 
 
 def test_below_the_blind_height_the_target_need_not_be_in_view() -> None:

@@ -1,0 +1,135 @@
+"""What goes wrong during a landing in a closed loop: it recovers or is broken off, and never ends beside the deck."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from estimation.landing import Mode, Reason
+from simulation.mishaps import Mishap
+from simulation.mission import Mission, load_mission
+from simulation.world import Flown, fly
+
+SEED = 1
+
+
+def mission(*mishaps: Mishap, longest_s: float = 90.0) -> Mission:
+    """Return a landing that takes half a minute where nothing goes wrong: it is over the deck's place soon."""
+    base = load_mission("landing_beaufort2_2026_11")
+    landing = {
+        "search_altitude_m": 10.0,
+        "observe_s": 6.0,
+        "observe_max_s": 15.0,
+        "wait_s": 8.0,
+        "search_s": 15.0,
+    }
+    landing["attempts"] = 2
+    return msgspec.structs.replace(
+        base, filter={**base.filter, "landing": landing}, start_m=(-4.0, -3.0, -2.0), longest_s=longest_s,
+        mishaps=mishaps,
+    )  # fmt: skip
+
+
+@dataclass
+class Told:
+    """When the modes of an undisturbed flight begin [s]: a mishap is put into one of them."""
+
+    observation: float
+    landing: float
+
+
+@pytest.fixture(scope="module")
+def told() -> Told:
+    flown = fly(mission(), SEED)
+    assert flown.end == "landed"
+    began = {}
+    for t, mode, _ in flown.transitions:
+        began.setdefault(mode, t)
+    return Told(began[Mode.OBSERVATION], began[Mode.LANDING])
+
+
+def on_the_deck_or_not_at_all(flown: Flown) -> None:
+    """Check what must hold whatever happens: no touchdown but inside r_land, in a descent; and an end."""
+    assert flown.end in ("landed", "given up", "time is up")
+    assert flown.t_s[-1] <= flown.mission.longest_s
+    if flown.contact is not None:
+        assert flown.contact.mode is Mode.LANDING
+        assert flown.contact.miss_m < flown.mission.config.landing.r_land_m
+    assert (flown.end == "landed") <= (flown.contact is not None)
+
+
+def reasons(flown: Flown) -> set[Reason]:
+    return {reason for _, _, reason in flown.transitions}
+
+
+CASES: list[tuple[str, str, dict[str, Any], bool, Reason | None]] = [
+    # What happens; in which mode; how; whether it lands all the same; the reason that it is answered with.
+    ("loss", "landing", {"duration_s": 5.0}, True, Reason.TARGET_LOST),
+    ("camera_freeze", "landing", {"duration_s": 5.0}, True, Reason.TARGET_LOST),
+    ("clock_step", "observation", {"by_s": 0.5}, True, Reason.ESTIMATE_STALE),
+    ("clock_step", "observation", {"by_s": -0.5}, True, None),
+    ("loss", "landing", {"sensor": "imu", "duration_s": 0.3}, True, Reason.ESTIMATE_STALE),
+    ("link_loss", "landing", {"duration_s": 3.0}, True, Reason.ESTIMATE_STALE),
+    ("packet_loss", "", {"share": 0.3}, True, None),
+    ("gps_drift", "observation", {"offset_m": (0.1, 0.05, 0.0)}, True, None),
+    ("loss", "landing", {}, False, Reason.TARGET_LOST),
+    ("camera_freeze", "landing", {}, False, Reason.TARGET_LOST),
+    ("false_target", "landing", {"offset_m": (2.0, 0.0, 0.0)}, False, Reason.TARGET_LOST),
+]
+QUICK = (2, 8)
+"""Those that are flown in every run of the tests; the others take a minute or two together."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode", "how", "lands", "answer"),
+    [pytest.param(*c, marks=[] if k in QUICK else pytest.mark.nightly) for k, c in enumerate(CASES)],
+)
+def test_a_mishap_is_recovered_from_or_ends_the_landing(
+    told: Told, kind: Any, mode: str, how: dict[str, Any], lands: bool, answer: Reason | None
+) -> None:
+    start = {"landing": told.landing + 2.0, "observation": told.observation + 3.0, "": 0.0}[mode]
+    flown = fly(mission(Mishap(kind=kind, start_s=start, **how)), SEED)
+    on_the_deck_or_not_at_all(flown)
+    assert (flown.end == "landed") == lands
+    if answer is not None:
+        # It is noticed within what the landing modes allow for.
+        after = [(t, mode, reason) for t, mode, reason in flown.transitions if t >= start]
+        allowed = 3.5 if answer is Reason.ESTIMATE_STALE else flown.mission.config.landing.lost_s + 0.5
+        assert after[0][2] is answer
+        assert after[0][0] - start < allowed
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.parametrize(
+    "mishap",
+    [
+        Mishap(kind="gps_jump", start_s=17.0, offset_m=(15.0, 0.0, 0.0)),
+        Mishap(kind="gps_jump", start_s=17.0, offset_m=(5.0, -3.0, 4.0)),
+        Mishap(kind="gps_drift", start_s=8.0, offset_m=(0.3, 0.2, 0.0)),
+        Mishap(kind="false_target", start_s=9.0, offset_m=(2.0, 1.0, 0.0)),
+        Mishap(kind="false_target", start_s=24.0, offset_m=(0.0, -1.0, 0.0)),
+        Mishap(kind="loss", start_s=27.0),
+        Mishap(kind="packet_loss", start_s=0.0, share=0.3),
+    ],
+    ids=lambda m: f"{m.kind}-{m.start_s:g}",
+)
+def test_whatever_misleads_it_never_touches_down_beside_the_deck(mishap: Mishap, seed: int) -> None:
+    on_the_deck_or_not_at_all(fly(mission(mishap), seed))
+
+
+def test_a_jump_of_the_gps_does_not_lead_the_vehicle_down_beside_the_deck(told: Told) -> None:
+    jump = Mishap(kind="gps_jump", start_s=told.landing + 1.0, offset_m=(15.0, 0.0, 0.0))
+    flown = fly(mission(jump, longest_s=told.landing + 12.0), SEED)
+    on_the_deck_or_not_at_all(flown)
+    # It stays over the deck until the landing is broken off; then it searches, high up, where the GPS has the anchor.
+    broken_off = [t for t, mode, _ in flown.transitions if t > jump.start_s and mode is Mode.ABORT]
+    assert broken_off
+    before = (flown.t_s > jump.start_s) & (flown.t_s < broken_off[0])
+    assert np.linalg.norm(flown.truth[before, :2] - flown.deck[before, :2], axis=1).max() < 1.5
+    after = flown.t_s > broken_off[0] + 2.0
+    assert (flown.deck[after, 2] - flown.truth[after, 2]).min() > 2.0
