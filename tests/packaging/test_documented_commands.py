@@ -1,8 +1,7 @@
 """Every command and every Python example of the README and the guides is run, on small files of the names they use.
 
-Commands that follow each other on a page run in one folder, so that one takes what another made. Where the page shows
-alternatives that write the same file, ``--force`` is added. What cannot be run here is listed with the reason, and at
-least its options are parsed.
+Commands that follow each other on a page run in one folder, as they stand, so that one takes what another made. What
+cannot be run here is listed with the reason, and at least its options are parsed.
 """
 
 from __future__ import annotations
@@ -83,10 +82,7 @@ def run(command: str, folder: Path, special: dict, capfd: pytest.CaptureFixture[
     words = shlex.split(command)
     used = {w.split("/")[0] for w in words} - outputs(command)
     provide(folder, used, special)
-    name = words[1]
-    forces = any("--force" in p.opts for p in program.commands[name].params)
-    arguments = expanded(words[1:], folder) + (["--force"] if forces and "--force" not in words else [])
-    status = main(arguments)
+    status = main(expanded(words[1:], folder))
     said = capfd.readouterr()
     assert status == 0, f"{command}\n{said.out}{said.err}"
     for written in outputs(command):
