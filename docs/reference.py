@@ -8,8 +8,10 @@ The pages are committed, and a test demands that they are what this writes: what
 from __future__ import annotations
 
 import inspect
+import json
 import re
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -24,6 +26,12 @@ from estimation.config import Config
 from estimation.outcome import EXPLANATIONS, Outcome
 from estimation.state import BLOCKS
 from logs.topics import TOPICS, definition_text
+from simulation.fixes import View
+from simulation.flight import Scenario, SiteTable, WavesTable, WindTable
+from simulation.platform import Raft
+from simulation.sea import Wave
+from simulation.sensors import Clock, Stream, Streams, VisionStream
+from simulation.trajectory import Plan, Rock
 
 FOLDER = Path(__file__).with_name("reference")
 WRITTEN = "<!-- Written by docs/reference.py from the code. Change the code, then run it again. -->\n"
@@ -61,19 +69,25 @@ def configuration() -> str:
 
 def table_of(kind: type[msgspec.Struct]) -> Iterator[str]:
     """Yield the lines of the table of a configuration's table."""
-    described = any(meta_of(hint).description for hint in get_type_hints(kind, include_extras=True).values())
-    yield "| key | default | unit | allowed |" + (" meaning |" if described else "")
-    yield "|---|---|---|---|" + ("---|" if described else "")
-    defaults = kind()
-    for name, hint in get_type_hints(kind, include_extras=True).items():
-        meta, value = meta_of(hint), getattr(defaults, name)
-        if isinstance(value, msgspec.Struct):
+    hints = get_type_hints(kind, include_extras=True)
+    described = any(meta_of(hint).description for hint in hints.values())
+    titles = ["key", "default", "unit", "allowed", "meaning"] if described else ["key", "default", "allowed"]
+    rows = []
+    for field in msgspec.structs.fields(kind):
+        hint, meta = hints[field.name], meta_of(hints[field.name])
+        factory = field.default_factory
+        value = field.default if factory is msgspec.NODEFAULT else factory()
+        if isinstance(value, msgspec.Struct | dict):
             continue
-        unit = (meta.extra or {}).get("unit", "-")
-        cells = [f"`{name}`", shown(value), unit, allowed(hint, meta)]
-        yield (
-            "| " + " | ".join(cell(c) for c in cells + ([meta.description or ""] if described else [])) + " |"
-        )
+        cells = [f"`{field.name}`", shown(value)]
+        cells += [(meta.extra or {}).get("unit", "-")] if described else []
+        cells += [allowed(hint, meta)] + ([meta.description or ""] if described else [])
+        rows.append(cells)
+    if rows:
+        yield "| " + " | ".join(titles) + " |"
+        yield "|---" * len(titles) + "|"
+    for cells in rows:
+        yield "| " + " | ".join(cell(c) for c in cells) + " |"
 
 
 def meta_of(hint: Any) -> msgspec.Meta:
@@ -84,36 +98,76 @@ def meta_of(hint: Any) -> msgspec.Meta:
 
 def shown(value: object) -> str:
     """Return a default as it would stand in the file."""
+    if value is msgspec.NODEFAULT:
+        return "required"
     if value is None:
         return "none"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
     if isinstance(value, str):
         return f'`"{value}"`'
+    if isinstance(value, datetime):
+        return f"`{value.isoformat()}`"
     if isinstance(value, tuple):
-        return f"`{list(value)}`"
+        return f"`{json.dumps(value)}`"
     return f"`{value!r}`"
 
 
 def allowed(hint: Any, meta: msgspec.Meta) -> str:
     """Return the values that are allowed: a type, a choice, or a type with its bounds."""
     kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-    kinds = [k for k in get_args(kind) if k is not type(None)] if get_origin(kind) is not Literal else []
     if get_origin(kind) is Literal:
         return ", ".join(f'`"{choice}"`' for choice in get_args(kind))
     if get_origin(kind) is tuple:
-        return f"{len(get_args(kind))} numbers"
-    if len(kinds) > 1:
-        return ", ".join(allowed(k, meta) for k in kinds)
-    if len(kinds) == 1:
-        kind, meta = (get_args(kinds[0])[0], meta_of(kinds[0])) if get_args(kinds[0]) else (kinds[0], meta)
-    word = {float: "number", int: "whole number", bool: "true, false", str: "text"}[kind]
+        inner = [k for k in get_args(kind) if k is not Ellipsis]
+        if any(get_origin(k) is tuple for k in inner):
+            return f"a list of lists of {len(get_args(inner[0]))} numbers"
+        if any(isinstance(k, type) and issubclass(k, msgspec.Struct) for k in inner):
+            return "tables, below"
+        return "a list of numbers" if len(inner) < len(get_args(kind)) else f"{len(inner)} numbers"
+    kinds = [k for k in get_args(kind) if k is not type(None)]
+    if kinds:
+        return ", ".join(allowed(k, meta_of(k) if get_origin(k) is Annotated else meta) for k in kinds)
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return "a table, below"
+    words = {
+        float: "number",
+        int: "whole number",
+        bool: "true, false",
+        str: "text",
+        datetime: "date and time",
+    }
+    word = words[kind]
     bounds = [
         f"{sign} {bound:g}"
         for sign, bound in ((">", meta.gt), ("≥", meta.ge), ("<", meta.lt), ("≤", meta.le))
         if bound is not None
     ]
     return word + (f" {' and '.join(bounds)}" if bounds else "")
+
+
+def scenario() -> str:
+    """Return the page of the files that ``deckfix simulate`` takes: the tables of a scenario."""
+    parts = [
+        WRITTEN,
+        "# Scenarios\n",
+        "What a TOML file for `deckfix simulate` may say ([how](../simulate.md)). `[filter]` is a",
+        "[configuration](configuration.md): the estimator is told it, and the sensors are drawn from it; `[mismatch]`,",
+        "of the same tables, replaces it for the drawing alone, so that the estimator is told something else than is",
+        "true. Names carry their units.\n",
+        "## Top of the file\n",
+        *table_of(Scenario),
+        "",
+    ]
+    tables: list[tuple[str, type[msgspec.Struct]]] = [
+        ("site", SiteTable), ("plan", Plan), ("sea", WavesTable), ("sea.waves", Wave), ("raft", Raft),
+        ("wind", WindTable), ("rock", Rock), ("streams", Streams), ("streams.SENSOR", Stream),
+        ("streams.vision", VisionStream), ("streams.vision.view", View), ("clocks.NAME", Clock),
+    ]  # fmt: skip
+    for name, kind in tables:
+        title = f"`[[{name}]]`" if kind is Wave else f"`[{name}]`"
+        parts += [f"## {title}\n", sentence(kind), "", *table_of(kind), ""]
+    return "\n".join(parts)
 
 
 def topics() -> str:
@@ -252,6 +306,7 @@ def code(text: str) -> str:
 PAGES: dict[str, Callable[[], str]] = {
     "configuration.md": configuration,
     "topics.md": topics,
+    "scenario.md": scenario,
     "commands.md": commands,
 }
 

@@ -66,7 +66,9 @@ def parsed(command: str) -> click.Context:
 def outputs(command: str) -> set[str]:
     words = shlex.split(command)
     return {
-        b for a, b in itertools.pairwise(words) if a in ("-o", "--output", "--write", "--report", "--json")
+        b
+        for a, b in itertools.pairwise(words)
+        if a in ("-o", "--output", "--write", "--report", "--json") and b != "-"
     }
 
 

@@ -27,7 +27,7 @@ def reference() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", ["configuration.md", "topics.md", "commands.md"])
+@pytest.mark.parametrize("name", ["configuration.md", "topics.md", "scenario.md", "commands.md"])
 def test_the_reference_is_what_the_code_says(name: str) -> None:
     written = (DOCS / "reference" / name).read_text(encoding="utf-8")
     assert reference().PAGES[name]() == written, "run python docs/reference.py and commit what it writes"

@@ -14,6 +14,7 @@ from deckfix.cli import deckfix as program
 from estimation.config import Config, parse_config
 from logs.topics import TOPICS, definition
 from logs.writer import CLOCKS
+from simulation.flight import parse_scenario
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -65,7 +66,10 @@ def test_files_of_the_code_exist(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_configurations_shown_are_valid(page: Path) -> None:
     for block in re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.S):
-        parse_config(block, page.name)
+        if "[plan]" in block:
+            parse_scenario(block, page.name)
+        else:
+            parse_config(block, page.name)
 
 
 def test_options_shown_exist() -> None:
