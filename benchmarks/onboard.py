@@ -124,7 +124,11 @@ def read(said: str, log: Path) -> dict[str, Any]:
     return {
         "latency_ms": {"median": float(end[1]), "p95": float(end[2]), "n": int(end[3])},
         "cpu_share": 0.01 * float(end[4]),
-        "memory_mb": {"end": float(end[5]), "growth_per_30_min": growth(np.array(memory))},
+        "memory_mb": {
+            "end": float(end[5]),
+            "growth_per_30_min": growth(np.array(memory)),
+            "every_10_s": [m for _, m in memory],
+        },
         "counts": dict(zip(("estimates", "images", "fixes", "fused", "landing_target"), map(int, counts.groups()),
                            strict=True)),
         "load_average": os.getloadavg()[1],

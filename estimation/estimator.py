@@ -521,6 +521,7 @@ class LandingEstimator:
             estimate_at(self._estimates[-1], self._estimates[-1].count - 1) if self._estimates else None
         )
         self._estimates.clear()
+        self._heave.clear()  # a run's only: one is a megabyte
         return Output(estimate, self._ledger.take_records(self._names), self._ledger.take_notes())
 
     def _collect(self) -> tuple[Estimates, NDArray[np.void], list[tuple[int, str]]]:

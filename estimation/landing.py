@@ -45,6 +45,8 @@ CONTACT_SPREAD_S = 0.3
 LONGEST_DESCENT = 4.0
 """A last descent that takes longer than this multiple of what it should take is broken off."""
 STATION_M = 3.0
+FASTEST_DRIFT_MPS = 0.5
+"""A platform on its anchor drifts no faster."""
 LEFT_PROBABILITY = 0.5
 """The observation ends when being inside r_track is no more probable than this."""
 
@@ -59,6 +61,9 @@ class Mode(IntEnum):
     LANDING = 4
     LANDED = 5
     ABORT = 6
+
+
+_OVER_THE_DECK = (Mode.TRACKING, Mode.OBSERVATION, Mode.LANDING)
 
 
 class Reason(StrEnum):
@@ -134,6 +139,8 @@ class Progress:
     ``since_ns`` is the begin of the mode, ``met_ns`` since when the condition for going on has held, ``descent_ns``
     the begin of the last descent (None: not yet), ``station_ns`` the arrival over the anchor, ``attempts`` the aborts.
     ``rate_power_m2ps2`` is the mean square of the deck's rate over the ``rate_count`` steps of the observation.
+    ``drift_mps`` north and east is how fast the place drifts that is to be kept, ``stepped_ns`` when that was last
+    corrected.
     """
 
     mode: Mode = Mode.IDLE
@@ -146,6 +153,8 @@ class Progress:
     yaw_rad: float = 0.0
     rate_power_m2ps2: float = 0.0
     rate_count: int = 0
+    drift_mps: tuple[float, float] = (0.0, 0.0)
+    stepped_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +227,7 @@ def inside_probability(mean: Array, covariance: Array, radius: float) -> float:
 
 def step(before: Progress, seen: Situation, c: LandingConfig) -> tuple[Progress, Decision]:
     """Return the next state of the landing and what to do. Same arguments, same result."""
-    after = _transition(before, seen, c)
+    after = _followed(before, _transition(before, seen, c), seen, c)
     return after, _decide(after, seen, c)
 
 
@@ -371,6 +380,24 @@ def _mode_s(p: Progress, seen: Situation) -> float:
     return (seen.now_ns - p.since_ns) * 1e-9
 
 
+def _followed(before: Progress, after: Progress, seen: Situation, c: LandingConfig) -> Progress:
+    """Correct the drift by the place's error while the target is in view: what the position's gain alone would have to
+    answer with a lasting error.
+    """
+    e = seen.estimate
+    if after.mode not in _OVER_THE_DECK or e is None:
+        return after if after.stepped_ns is None else replace(after, drift_mps=(0.0, 0.0), stepped_ns=None)
+    north, east = after.drift_mps
+    off = math.hypot(e.deck[0], e.deck[1])
+    if before.stepped_ns is not None and seen.detection_age_s < FRESH_S and off < c.r_track_m:
+        dt = min(max((seen.now_ns - before.stepped_ns) * 1e-9, 0.0), 0.2)
+        north -= c.drift_gain * float(e.deck[0]) * dt
+        east -= c.drift_gain * float(e.deck[1]) * dt
+        share = min(1.0, FASTEST_DRIFT_MPS / max(math.hypot(north, east), 1e-9))
+        north, east = share * north, share * east
+    return replace(after, drift_mps=(north, east), stepped_ns=seen.now_ns)
+
+
 # -- what is judged ------------------------------------------------------------------------------------------------
 
 
@@ -433,6 +460,7 @@ def _decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
         return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.track_tilt_rad, aim, nan, nan)
     velocity = np.empty(3)
     velocity[:2] = sway_ahead(e, seen.forecast, c.response_level_s)
+    velocity[:2] += p.drift_mps
     velocity[:2] += _towards(-e.deck[:2], c.speed_mps, c.position_gain)
     if p.mode is not Mode.LANDING:
         altitude = c.track_share * search_altitude_m(c)

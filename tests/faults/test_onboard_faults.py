@@ -142,6 +142,9 @@ def test_files_and_cameras_that_do_not_fit(folder: Path, capsys: pytest.CaptureF
     assert "gives 640 x 480 pixels, the camera file is for 320 x 240" in said
     said = refused(capsys, *base, "--record", str(folder / "target.toml"))
     assert "is a file; give a folder" in said
+    # Nobody can make a folder below a file, whoever runs the test.
+    said = refused(capsys, *base, "--record", str(folder / "target.toml" / "flights"))
+    assert "cannot be created" in said
     said = refused(capsys, *base, "--publish", "everything")
     assert "use landing_target or odometry" in said
     bare = ["--mavlink", base[1], "--camera", video]

@@ -136,6 +136,7 @@ def test_the_probability_of_being_inside_is_that_of_draws(
 
 
 @given(mean, st.floats(0.1, 3.0))
+@settings(deadline=None)
 def test_a_point_is_inside_or_not(m: np.ndarray, radius: float) -> None:
     distance = float(np.hypot(*m))
     if abs(distance - radius) > 1e-3 * radius:
@@ -144,6 +145,7 @@ def test_a_point_is_inside_or_not(m: np.ndarray, radius: float) -> None:
 
 
 @given(st.floats(0.5, 30.0), st.floats(0.0, 10.0), st.floats(0.0, 10.0), st.floats(0.3, 2.0))
+@settings(deadline=None)
 def test_from_the_search_altitude_the_platform_is_in_view(
     r: float, horizontal: float, vertical: float, fov: float
 ) -> None:

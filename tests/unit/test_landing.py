@@ -149,6 +149,28 @@ def test_what_stands_before_it_could_be_led_up_stays() -> None:
     assert p.descent_ns is not None
 
 
+def test_a_drifting_place_is_followed_without_a_lasting_error() -> None:
+    c = replace_field(LandingConfig(), observe_s=90.0, observe_max_s=90.0)
+    p, lag_s, t_ns = Progress(Mode.OBSERVATION), 0.4, 0
+    place, velocity = np.array([0.0, 0.0]), np.zeros(2)
+    for k in range(60 * 20):
+        t_ns = k * 50_000_000
+        deck = 0.2 * k * 0.05 * np.array([1.0, -0.5])
+        off = place - deck
+        p, said = step(
+            p,
+            Situation(t_ns, estimate(t_ns, (off[0], off[1], -7.0)), 0.1),
+            c,
+        )
+        assert said.mode is Mode.OBSERVATION
+        velocity += (said.velocity_mps[:2] - velocity) * 0.05 / lag_s
+        place += velocity * 0.05
+    assert np.abs(off).max() < 0.01
+    assert p.drift_mps == pytest.approx([0.2, -0.1], abs=0.01)
+    away, _ = step(p, Situation(t_ns, estimate(t_ns, (0.0, 0.0, -7.0)), 1.5), c)
+    assert away.drift_mps == (0.0, 0.0)
+
+
 def test_the_time_to_contact_is_that_of_the_descent() -> None:
     c = LandingConfig()
     for height in (0.05, 0.3, 0.6, 1.2, 3.0):
