@@ -49,26 +49,43 @@ class MarkerRenderer(Renderer):
         v0, v1 = int(max(0, v.min() - 1)), int(min(h, v.max() + 2))
         if u0 >= u1 or v0 >= v1:
             return where
-        offset = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
-        fine_u = (np.arange(u0, u1)[:, None] + offset).ravel()
-        fine_v = (np.arange(v0, v1)[:, None] + offset).ravel()
-        black = np.empty((v1 - v0, u1 - u0))
         rotation, relative = deck.T @ attitude, deck.T @ position
-        cell = self._side_m / len(self._bits)
-        x, _ = self.camera.rays(fine_u, np.zeros_like(fine_u))
-        for row in range(v1 - v0):
-            _, y = self.camera.rays(np.zeros(SAMPLES), fine_v[row * SAMPLES : (row + 1) * SAMPLES])
-            ray = [rotation[i, 0] * x + rotation[i, 1] * y[:, None] + rotation[i, 2] for i in range(3)]
-            scale = -relative[2] / ray[2]
-            i = np.floor((relative[1] + scale * ray[1] + 0.5 * self._side_m) / cell).astype(np.intp)
-            j = np.floor((relative[0] + scale * ray[0] + 0.5 * self._side_m) / cell).astype(np.intp)
-            n = len(self._bits)
-            inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
-            dark = inside & (self._bits[np.clip(i, 0, n - 1), np.clip(j, 0, n - 1)] == 0)
-            black[row] = dark.reshape(SAMPLES, -1, SAMPLES).mean(axis=(0, 2))
+        # A pixel whose corners lie in one cell is of one colour; the others are sampled.
+        corner = self._cells(
+            rotation, relative, np.arange(u0, u1 + 1) - 0.5, np.arange(v0, v1 + 1)[:, None] - 0.5
+        )
+        first = corner[:-1, :-1]
+        mixed = (corner[:-1, 1:] != first) | (corner[1:, :-1] != first) | (corner[1:, 1:] != first)
+        # The marker's own corner may lie inside a pixel whose corners all lie beside it.
+        mixed = cv2.dilate(mixed.astype(np.uint8), np.ones((3, 3), dtype=np.uint8)) > 0
+        black = self._is_black(first).astype(np.float64)
+        row, column = np.nonzero(mixed)
+        offset = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
+        share = np.zeros(len(row))
+        for dv in offset:
+            for du in offset:
+                cells = self._cells(rotation, relative, u0 + column + du, v0 + row + dv)
+                share += self._is_black(cells)
+        black[row, column] = share / SAMPLES**2
         part = image[v0:v1, u0:u1]
         part += (black[..., None] * (BLACK_BGR * seen.light - part)).astype(np.float32)
         return where
+
+    def _cells(self, rotation: Array, relative: Array, u: Array, v: Array) -> NDArray[np.intp]:
+        """Return the number of the marker's cell that pixels show, -1 beside it."""
+        x, y = self.camera.rays(*np.broadcast_arrays(u, v))
+        ray = [rotation[i, 0] * x + rotation[i, 1] * y + rotation[i, 2] for i in range(3)]
+        scale = -relative[2] / ray[2]
+        n = len(self._bits)
+        cell = self._side_m / n
+        i = np.floor((relative[1] + scale * ray[1] + 0.5 * self._side_m) / cell).astype(np.intp)
+        j = np.floor((relative[0] + scale * ray[0] + 0.5 * self._side_m) / cell).astype(np.intp)
+        inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
+        return np.where(inside, i * n + j, -1)
+
+    def _is_black(self, cell: NDArray[np.intp]) -> NDArray[np.bool_]:
+        dark: NDArray[np.bool_] = (cell >= 0) & (self._bits.ravel()[np.maximum(cell, 0)] == 0)
+        return dark
 
 
 def marker_bits(dictionary: int, marker_id: int) -> NDArray[np.int_]:

@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimation.frames import R_CB_NOMINAL, skew
-from vision.area import fit_area
+from estimation.frames import R_CB_NOMINAL
+from vision.area import SCALES, fit_area
 from vision.camera import Camera, check_rotation
-from vision.ellipse import plane_rotations
+from vision.candidates import Candidate, Search
 from vision.engine import engine_of
 from vision.fix import NoFix, VisionFix
-from vision.judge import beyond_doubt, clearly_better, doubtful, judge_area, judge_profiles, rank
+from vision.judge import beyond_doubt, clearly_better, doubtful, inside_more, judge_area, judge_profiles, rank
 from vision.lines import edges_of, usable_edges
-from vision.plane import LevelPlane, rotation_to_level, rotation_vector_xy, rotation_xy
-from vision.redness import ratio_table, red_mask
+from vision.plane import LevelPlane, rotation_vector_xy, rotation_xy
+from vision.position import Positions
 from vision.refine import Fit, fit_profiles
 from vision.rings import (
-    Contours,
     Hypothesis,
-    find_contours,
-    halve,
-    identify_circles,
 )
 from vision.target import RingTarget
 from vision.thesis import thesis_detect
-from vision.votes import identify_votes
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -41,17 +32,10 @@ FREE_TILT_SIGMA_RAD = 0.6
 THESIS_RELATIVE_SIGMA = 0.07
 """1-sigma per axis of a fix by the thesis's method, as a share of the distance (its reported errors: 6-8
 %)."""
-MAX_DECK_TILT_RAD = 0.27
 MIN_DIAMETER_PX = 7.0
 """Outer diameter below which nothing can be told from a red spot."""
 SMALL_PX = 80.0
 """Outer diameter below which all pixels of the target are fitted where its edges could not be."""
-SHARP_BLUR_PX = 0.7
-BLUR_ERROR = 0.04
-"""Error of an edge's place that all edges share, per pixel of blur beyond that of a sharp picture, where blurred
-edges reach their neighbours."""
-GROWTH_ERROR = 0.06
-"""The same per pixel of growth beyond what noise explains: it is taken as equal for all edges, and is not quite."""
 MAX_FITS = 16
 MAX_AREA_FITS = 6
 """Limits of the work spent on one image."""
@@ -127,7 +111,14 @@ class TargetDetector:
         self._edge_table = edges_of(self._edges)
         self._margin_m = 0.5 * target.side_m - self._edges[0]
         self._engine = engine_of(engine)
-        self._tables = tuple(ratio_table(ratio) for ratio in (1.3, 1.8, 1.12))
+        self._places = Search(camera, self._edges, self._engine.label)
+        self._positions = Positions(
+            self._edge_table,
+            self.attitude_sigma_rad,
+            self.focal_sigma,
+            self.principal_point_sigma_px,
+            self.model_error_px,
+        )
 
     def detect(
         self,
@@ -208,24 +199,24 @@ class TargetDetector:
         p = plane.rotation @ expected
         if not p[2] > 0.0:
             return None
-        candidate = _Candidate(Hypothesis(p[:2] / p[2], 1.0 / float(p[2]), (), 1.0), plane, tilt)
+        candidate = Candidate(Hypothesis(p[:2] / p[2], 1.0 / float(p[2]), (), 1.0), plane, tilt)
         left = {"fits": 1, "area": 1}
-        fit = self._fit(image, candidate, rotation is None, left)
+        fit = self._fit(image, candidate, rotation is None, left, scales=(1.0,))
         return None if isinstance(fit, str) else self._fix([fit], rotation, "tracked")
 
     def _search(self, image: Image, rotation: Array | None, rate: Array | None) -> VisionFix | NoFix:
         reason = "no red region of the target's kind"
         left = {"fits": MAX_FITS, "area": MAX_AREA_FITS}
-        for contours in self._contour_sets(image):
-            for candidates in self._candidates(contours, rotation, rate):
+        for contours in self._places.contour_sets(image):
+            for candidates in self._places.candidates(contours, rotation, rate):
                 accepted: list[Fit] = []
                 for candidate in candidates:
                     fit = self._fit(image, candidate, rotation is None, left)
                     if isinstance(fit, str):
                         reason = fit or reason
                         continue
-                    if not (fit.share > 0.95 and 0 in fit.edges and not fit.is_area) and self._inside_more(
-                        image, fit
+                    if not (fit.share > 0.95 and 0 in fit.edges and not fit.is_area) and inside_more(
+                        image, fit, self._edges[0]
                     ):
                         reason = "rings, but with more red rings around them"
                         continue
@@ -238,61 +229,18 @@ class TargetDetector:
                 reason = "red regions, but no concentric rings of the target's ratios"
         return NoFix(reason)
 
-    def _contour_sets(self, image: Image) -> Iterator[Contours]:
-        table, strict, lax = self._tables
-        yield find_contours(red_mask(halve(image), table), True)
-        yield find_contours(red_mask(image, table), False)
-        yield find_contours(red_mask(image, strict), False)
-        yield find_contours(red_mask(image, lax), False)
-
-    def _candidates(
-        self, contours: Contours, rotation: Array | None, rate: Array | None
-    ) -> Iterator[list[_Candidate]]:
-        """Yield lists of candidates, the cheapest and likeliest first."""
-        if not len(contours):
-            return
-        level = np.zeros(2)
-        if rotation is not None:
-            plane = LevelPlane(self.camera, rotation, rate)
-            yield [
-                _Candidate(h, plane, level)
-                for h in identify_circles(contours, plane.view, self._edges, self._engine.label)
-            ]
-            yield [_Candidate(h, plane, level) for h in identify_votes(contours, plane, self._edges)]
-        candidates: list[_Candidate] = []
-        for plane in self._ellipse_planes(contours, rate):
-            tilt = level
-            if rotation is not None:
-                # A deck that is tilted against the level: its normal stays near the vertical.
-                turn = rotation_to_level(rotation @ plane.rotation[2])
-                tilt = rotation_vector_xy(turn)
-                if np.hypot(*tilt) > MAX_DECK_TILT_RAD:
-                    continue
-                plane = LevelPlane(self.camera, turn @ rotation, rate)
-            candidates += [
-                _Candidate(h, plane, tilt)
-                for h in identify_circles(contours, plane.view, self._edges, self._engine.label)
-            ]
-        yield sorted(candidates, key=lambda c: -c.hypothesis.score)
-
-    def _ellipse_planes(self, contours: Contours, rate: Array | None) -> Iterator[LevelPlane]:
-        """Yield the planes in which one of the longest contours is a circle."""
-        plane = LevelPlane(self.camera, np.eye(3), rate)
-        x, y = plane.rays(contours.u, contours.v)
-        inside = plane.inside(contours.u, contours.v, contours.step_px)
-        count = np.diff(contours.start)
-        for i in np.argsort(-count, kind="stable")[:6]:
-            mine = slice(contours.start[i], contours.start[i + 1])
-            ok = inside[mine]
-            if ok.sum() >= 16:
-                max_rms = 0.7 * contours.step_px / self.camera.fx
-                for rotation in plane_rotations(x[mine][ok], y[mine][ok], max_rms):
-                    yield LevelPlane(self.camera, rotation, rate)
-
-    def _fit(self, image: Image, candidate: _Candidate, free: bool, left: dict[str, int]) -> Fit | str:
+    def _fit(
+        self,
+        image: Image,
+        candidate: Candidate,
+        free: bool,
+        left: dict[str, int],
+        scales: tuple[float, ...] = SCALES,
+    ) -> Fit | str:
         """Fit a candidate and judge it: the fit, or the reason why it is none.
 
         ``left`` counts down what may still be tried on this image; where nothing is left the reason is empty.
+        ``scales`` are tried around a small target's, relative to the candidate's.
         """
         plane, hypothesis = candidate.plane, candidate.hypothesis
         unit = float(plane.units_per_pixel(hypothesis.centre[0], hypothesis.centre[1]))
@@ -304,7 +252,7 @@ class TargetDetector:
             else float(np.hypot(self.attitude_sigma_rad, self.deck_tilt_sigma_rad))
         )
         if usable.sum() < min(3, len(self._edges)):
-            return self._fit_small(image, candidate, sigma, left)
+            return self._fit_small(image, candidate, sigma, left, scales)
         if left["fits"] <= 0:
             return ""
         left["fits"] -= 1
@@ -329,26 +277,17 @@ class TargetDetector:
                 fit = tilted
         judged = judge_profiles(fit, self.min_share)
         if isinstance(judged, str) and 2.0 * self._edges[0] * to_px < SMALL_PX:
-            small = self._fit_small(image, candidate, sigma, left)
+            small = self._fit_small(image, candidate, sigma, left, scales)
             return judged if isinstance(small, str) else small
         return judged
 
-    def _inside_more(self, image: Image, fit: Fit) -> bool:
-        """Return whether there is a red ring around what was taken for the outermost edge."""
-        angle = np.arange(32) * (np.pi / 16.0)
-        radius = fit.kappa * self._edges[0] * np.linspace(1.15, 2.8, 12)[:, None]
-        u, v = fit.plane.to_pixels(
-            fit.centre[0] + radius * np.cos(angle), fit.centre[1] + radius * np.sin(angle)
-        )
-        seen = fit.plane.inside(u, v, 1.0)
-        pixels = np.zeros((*u.shape, 3))
-        pixels[seen] = image[np.rint(v[seen]).astype(np.intp), np.rint(u[seen]).astype(np.intp)]
-        red = pixels[..., 2] > 1.3 * pixels[..., :2].max(axis=-1) + 4.0
-        visible = seen.sum(axis=1)
-        return bool(((red.sum(axis=1) > 0.4 * visible) & (visible >= 6)).any())
-
     def _fit_small(
-        self, image: Image, candidate: _Candidate, tilt_sigma_rad: float, left: dict[str, int]
+        self,
+        image: Image,
+        candidate: Candidate,
+        tilt_sigma_rad: float,
+        left: dict[str, int],
+        scales: tuple[float, ...],
     ) -> Fit | str:
         """Fit all pixels of a small target: in one light first, then with a light for each sector."""
         if left["area"] <= 0:
@@ -368,10 +307,12 @@ class TargetDetector:
                 candidate.plane,
                 hypothesis.centre,
                 hypothesis.kappa,
-                self._edges,
+                self._edge_table,
                 margin_m=self._margin_m,
                 tilt_sigma_rad=tilt_sigma_rad,
                 sectors=sectors,
+                scales=scales,
+                solver=self._engine.area,
             )
             judged = judge_area(fit, sectors > 1, self.min_share, max_blur_px)
             if isinstance(judged, str):
@@ -386,12 +327,12 @@ class TargetDetector:
 
     def _fix(self, fits: list[Fit], rotation: Array | None, how: str) -> VisionFix:
         best = max(fits, key=rank)
-        position, covariance = self._position(best, rotation is not None)
+        position, covariance = self._positions.of(best, rotation is not None)
         if rotation is None:
             # Two planes see the same ellipse; where they fit equally well, either may be the right one.
             for other in fits:
                 if other is not best and other.residual_px < 1.2 * best.residual_px:
-                    d = self._position(other, False)[0] - position
+                    d = self._positions.of(other, False)[0] - position
                     covariance = covariance + 0.5 * np.outer(d, d)
         tilt = None
         if rotation is not None and best.tilt_free:
@@ -409,43 +350,6 @@ class TargetDetector:
             best.points_px,
             best.agrees,
         )
-
-    def _position(self, fit: Fit, known_attitude: bool) -> tuple[Array, Array]:
-        """Return P^c [m] and its covariance [m^2]."""
-        plane, kappa = fit.plane, fit.kappa
-        ray = np.array([fit.centre[0], fit.centre[1], 1.0])
-        back = plane.rotation.T
-        position = back @ ray / kappa
-        jacobian = np.empty((3, 5))
-        jacobian[:, :2] = back[:, :2] / kappa
-        jacobian[:, 2] = -position / kappa
-        jacobian[:, 3:] = (back @ skew(ray))[:, :2] / kappa
-        unit = float(plane.units_per_pixel(fit.centre[0], fit.centre[1]))
-        # The wider an edge and the nearer its neighbours, the more the shape of its profile matters.
-        gap_px = float(self._edge_table.near_m[list(fit.edges)].min()) * kappa / unit
-        crowding = min(1.0, 6.0 * fit.blur_px / gap_px)
-        blur_error = BLUR_ERROR * max(0.0, fit.blur_px - SHARP_BLUR_PX) * crowding
-        growth = math.sqrt(max(0.0, fit.growth_px**2 - fit.growth_sigma_px**2))
-        outward = math.hypot(self.model_error_px, blur_error, GROWTH_ERROR * growth)
-        inner = fit.covariance.copy()
-        inner[0, 0] += (self.model_error_px * unit) ** 2
-        inner[1, 1] += (self.model_error_px * unit) ** 2
-        sigmas = (self.focal_sigma, self.principal_point_sigma_px, self.principal_point_sigma_px, outward)
-        shifts = fit.considered * sigmas
-        covariance = jacobian @ (inner + shifts @ shifts.T) @ jacobian.T
-        if known_attitude and self.attitude_sigma_rad > 0.0:
-            turn = skew(position)
-            covariance += self.attitude_sigma_rad**2 * (turn @ turn.T)
-        return position, 0.5 * (covariance + covariance.T)
-
-
-@dataclass(frozen=True, slots=True)
-class _Candidate:
-    """A hypothesis, the plane it holds in, and that plane's tilt against the level (2,) [rad]."""
-
-    hypothesis: Hypothesis
-    plane: LevelPlane
-    tilt: Array
 
 
 def _sigma(name: str, value: float, limit: float) -> float:

@@ -6,16 +6,18 @@ from functools import cache
 from importlib.util import find_spec
 from typing import NamedTuple
 
+from vision.area import AreaSolver, solve_area
 from vision.refine import Solver, solve_profiles
 from vision.rings import Labeller, label_circles
 
 
 class Engine(NamedTuple):
-    """The two steps of the detector that are compiled."""
+    """The three steps of the detector that are compiled."""
 
     name: str
     solve: Solver
     label: Labeller
+    area: AreaSolver
 
 
 def engine_of(name: str) -> Engine:
@@ -28,7 +30,9 @@ def engine_of(name: str) -> Engine:
     installed = find_spec("numba") is not None
     if name == "compiled" and not installed:
         raise ValueError("engine: 'compiled' needs numba; pip install 'deckfix[fast]'")
-    return _compiled() if installed and name != "numpy" else Engine("numpy", solve_profiles, label_circles)
+    if installed and name != "numpy":
+        return _compiled()
+    return Engine("numpy", solve_profiles, label_circles, solve_area)
 
 
 @cache
@@ -36,4 +40,4 @@ def _compiled() -> Engine:
     from vision import compiled
 
     compiled.compile_now()
-    return Engine("compiled", compiled.solve, compiled.label)
+    return Engine("compiled", compiled.solve, compiled.label, compiled.solve_small)

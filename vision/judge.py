@@ -4,8 +4,11 @@ sharpness."""
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vision.refine import Fit
+
+Image = NDArray[np.uint8]
 
 MIN_RED_SLOPE = -0.35
 """Least change of R per change of (G + B) / 2 from red to white; on blue water it is about -1."""
@@ -87,10 +90,23 @@ def judge_area(fit: Fit | None, covered: bool, min_share: float, max_blur_px: fl
         return "a small red region, but not on white"
     if fit.contradicted > 0.0:
         return "a small red region whose rings have other radii"
-    if not (0.38 if covered else 0.28) < fit.blur_px < min(1.8, max_blur_px) or abs(fit.growth_px) > 0.45:
+    if not (0.38 if covered else 0.15) < fit.blur_px < min(1.8, max_blur_px) or abs(fit.growth_px) > 0.45:
         return "a small red region whose edges are not as sharp as the target's"
     if fit.chi2 < (MIN_GAIN_OVER_SMALL_DISC if few else MIN_GAIN_OVER_DISC):
         return "a small red disc without visible rings"
     if not fit.covariance[2, 2] < (0.1 * fit.kappa) ** 2:
         return "the scale is not observable"
     return fit
+
+
+def inside_more(image: Image, fit: Fit, radius_m: float) -> bool:
+    """Return whether there is a red ring around what was taken for the outermost edge."""
+    angle = np.arange(32) * (np.pi / 16.0)
+    radius = fit.kappa * radius_m * np.linspace(1.15, 2.8, 12)[:, None]
+    u, v = fit.plane.to_pixels(fit.centre[0] + radius * np.cos(angle), fit.centre[1] + radius * np.sin(angle))
+    seen = fit.plane.inside(u, v, 1.0)
+    pixels = np.zeros((*u.shape, 3))
+    pixels[seen] = image[np.rint(v[seen]).astype(np.intp), np.rint(u[seen]).astype(np.intp)]
+    red = pixels[..., 2] > 1.3 * pixels[..., :2].max(axis=-1) + 4.0
+    visible = seen.sum(axis=1)
+    return bool(((red.sum(axis=1) > 0.4 * visible) & (visible >= 6)).any())

@@ -205,11 +205,12 @@ def lay_lines(
     outward, inward = neighbours(edges)
     scale = kappa * per
     row[:, SIDE], row[:, HALF_PX], row[:, GAP_PX] = side, half, gap
-    row[:, BEND] = 0.5 * slope / rk
+    bent = bend_factor(view, qxm, qym, slope)
+    row[:, BEND] = 0.5 * slope / rk * bent
     row[:, OUTWARD_PX] = (outward[edge] - edges.radius_m[edge]) * scale
     row[:, INWARD_PX] = (edges.radius_m[edge] - inward[edge]) * scale
-    row[:, OUTWARD_BEND] = 0.5 / (outward[edge] * scale)
-    row[:, INWARD_BEND] = 0.5 / (np.maximum(inward[edge], 0.1 * edges.radius_m[-1]) * scale)
+    row[:, OUTWARD_BEND] = 0.5 / (outward[edge] * scale) * bent
+    row[:, INWARD_BEND] = 0.5 / (np.maximum(inward[edge], 0.1 * edges.radius_m[-1]) * scale) * bent
     row[:, U0], row[:, V0] = u0, v0
     row[:, NU], row[:, NV] = row[:, CONSIDERED + 1], row[:, CONSIDERED + 2]
     return lines
@@ -223,6 +224,17 @@ def neighbours(edges: Edges) -> tuple[Array, Array]:
     outward[1:] = edges.radius_m[:-1]
     inward[:-1] = edges.radius_m[1:]
     return outward, inward
+
+
+def bend_factor(view: View, qx: Any, qy: Any, slope: Any) -> Any:
+    """Return by how much an edge is more curved in the image than a circle of its scale along the radius.
+
+    A circle of radius R in the plane has in the image the curvature A^2 / (slope^3 R), with A the plane's area per
+    pixel at (qx, qy) and ``slope`` the gradient of the distance from the centre; without slant it is slope / R.
+    """
+    unit = units_per_pixel(view, qx, qy)
+    ratio = unit * unit / (slope * slope)
+    return ratio * ratio
 
 
 def line_design(cos: Any, sin: Any, qx: Any, qy: Any, radius_m: Any, per: Any, side: Any) -> tuple[Any, ...]:

@@ -71,8 +71,9 @@ class Measured(NamedTuple):
 
 
 def phi(t: Any) -> Any:
-    """Return the normal distribution function, to 3e-4 (Page's formula with tanh)."""
-    return 0.5 + 0.5 * np.tanh(SQRT_2_OVER_PI * t * (1.0 + 0.044715 * t * t))
+    """Return the normal distribution function, to 3e-4 (Page's formula, as a logistic function)."""
+    t = np.minimum(np.maximum(t, -8.0), 8.0)
+    return 1.0 / (1.0 + np.exp(-2.0 * SQRT_2_OVER_PI * t * (1.0 + 0.044715 * t * t)))
 
 
 def line_blur(blur_xy: Array, nu: Any, nv: Any) -> Any:

@@ -1,25 +1,15 @@
-"""Identification and photometric fit compiled by numba: the drivers as they stand, the array work as loops.
-
-The functions below replace, inside compiled code only, those whose NumPy form is made of many small array
-operations. All formulas are the same objects (``vision.view``, ``vision.lines``, ``vision.profile``,
-``vision.robust``, ``vision.rings``). The machine code is kept in the user's cache folder, named after the sources.
-"""
+"""Lines across single edges as loops, in place of ``vision.lines``, ``vision.profile`` and ``vision.refine``."""
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numba.extending import overload, register_jitable
+from numba.extending import overload
 from numpy.typing import NDArray
 
-from estimation.codecache import jitted
-from vision import lens, lines, plane, profile, refine, rings, robust, view
-from vision.camera import Camera
+from vision import lines, profile, refine, robust
 from vision.lines import (
     BEND,
     CLIPPED,
@@ -48,6 +38,7 @@ from vision.lines import (
     WEIGHT,
     Edges,
     Lines,
+    bend_factor,
     empty_lines,
     line_angle,
     line_considered,
@@ -67,136 +58,13 @@ from vision.profile import (
     line_solution_sharp,
     motion_of,
 )
-from vision.refine import Solution, is_contrary, solve_profiles
-from vision.rings import MIN_POINTS, is_around, is_match, kasa_centre, label_circles
-from vision.robust import kept, residual_scale
+from vision.refine import is_contrary
 from vision.view import View, inside, pixel_rays, plane_gradient, rays_to_plane, to_pixels
 
 Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 Int = NDArray[np.int64]
-
-_MODULES = (lens, lines, plane, profile, refine, rings, robust, view)
-
-
-@overload(view.whole)
-def _whole(x: Any) -> Callable[[Any], Any]:
-    def index(x: Any) -> Any:
-        return int(x)
-
-    return index
-
-
-@overload(view.either)
-def _either(condition: Any, a: Any, b: Any) -> Callable[[Any, Any, Any], Any]:
-    def choose(condition: Any, a: Any, b: Any) -> Any:
-        return a if condition else b
-
-    return choose
-
-
-@overload(robust.masked)
-def _masked(values: Array, keep: Bool) -> Callable[[Array, Bool], Array]:
-    def mask(values: Array, keep: Bool) -> Array:
-        out = np.zeros(len(values))
-        for i in range(len(values)):
-            if keep[i]:
-                out[i] = values[i]
-        return out
-
-    return mask
-
-
-@overload(robust.median)
-def _median(values: Array) -> Callable[[Array], float]:
-    def middle(values: Array) -> float:
-        """Sort by insertion: there are about fifty."""
-        ordered = values.copy()
-        for i in range(1, len(ordered)):
-            value = ordered[i]
-            j = i - 1
-            while j >= 0 and ordered[j] > value:
-                ordered[j + 1] = ordered[j]
-                j -= 1
-            ordered[j + 1] = value
-        return float(ordered[len(ordered) // 2])
-
-    return middle
-
-
-@overload(robust.times)
-def _times(matrix: Array, vector: Array) -> Callable[[Array, Array], Array]:
-    def product(matrix: Array, vector: Array) -> Array:
-        p, n = matrix.shape
-        out = np.empty(p)
-        for i in range(p):
-            total = 0.0
-            for j in range(n):
-                total += matrix[i, j] * vector[j]
-            out[i] = total
-        return out
-
-    return product
-
-
-@overload(robust.normal_equations)
-def _normal_equations(a: Array, weight: Array, b: Array) -> Callable[..., tuple[Array, Array]]:
-    def sums(a: Array, weight: Array, b: Array) -> tuple[Array, Array]:
-        p, n = a.shape
-        matrix, vector = np.zeros((n, n)), np.zeros(n)
-        for i in range(p):
-            w = weight[i]
-            if w != 0.0:
-                for j in range(n):
-                    wa = w * a[i, j]
-                    vector[j] += wa * b[i]
-                    for k in range(j + 1):
-                        matrix[j, k] += wa * a[i, k]
-        for j in range(n):
-            for k in range(j):
-                matrix[k, j] = matrix[j, k]
-        return matrix, vector
-
-    return sums
-
-
-@overload(robust.inverted)
-def _inverted(matrix: Array) -> Callable[[Array], tuple[bool, Array]]:
-    def inverse(matrix: Array) -> tuple[bool, Array]:
-        """Invert through the Cholesky factor."""
-        n = len(matrix)
-        low = np.zeros((n, n))
-        for j in range(n):
-            pivot = matrix[j, j]
-            for k in range(j):
-                pivot -= low[j, k] * low[j, k]
-            if not pivot > 0.0:
-                return False, matrix
-            low[j, j] = math.sqrt(pivot)
-            for i in range(j + 1, n):
-                value = matrix[i, j]
-                for k in range(j):
-                    value -= low[i, k] * low[j, k]
-                low[i, j] = value / low[j, j]
-        # The factor's inverse, then its square.
-        for j in range(n):
-            low[j, j] = 1.0 / low[j, j]
-            for i in range(j + 1, n):
-                value = 0.0
-                for k in range(j, i):
-                    value -= low[i, k] * low[k, j]
-                low[i, j] = value / low[i, i]
-        out = np.empty((n, n))
-        for i in range(n):
-            for j in range(i + 1):
-                value = 0.0
-                for k in range(i, n):
-                    value += low[k, i] * low[k, j]
-                out[i, j] = out[j, i] = value
-        return True, out
-
-    return inverse
 
 
 @overload(lines.lay_lines)
@@ -273,12 +141,13 @@ def _lay_lines(
                 pixel[VALUE], pixel[RED], pixel[WEIGHT] = value, float(at[2]), weight
             row[TOTAL], row[LEVEL] = total, level / max(total, 1.0)
             row[SIDE], row[HALF_PX], row[GAP_PX] = edges.side[edge], half, gap
-            row[BEND] = 0.5 * slope / rk
+            bent = bend_factor(view, qxm, qym, slope)
+            row[BEND] = 0.5 * slope / rk * bent
             scale = kappa * per
             row[OUTWARD_PX] = (outward[edge] - edges.radius_m[edge]) * scale
             row[INWARD_PX] = (edges.radius_m[edge] - inward[edge]) * scale
-            row[OUTWARD_BEND] = 0.5 / (outward[edge] * scale)
-            row[INWARD_BEND] = 0.5 / (max(inward[edge], 0.1 * edges.radius_m[-1]) * scale)
+            row[OUTWARD_BEND] = 0.5 / (outward[edge] * scale) * bent
+            row[INWARD_BEND] = 0.5 / (max(inward[edge], 0.1 * edges.radius_m[-1]) * scale) * bent
             d = line_design(cos, sin, qxm, qym, edges.radius_m[edge], per, edges.side[edge])
             for k in range(6):
                 row[DESIGN + k] = d[k]
@@ -443,131 +312,6 @@ def _crowded(lines: Lines, blur: Array) -> Callable[..., bool]:
     return any_near
 
 
-@overload(robust.reweighted)
-def _reweighted(
-    a: Array, delta: Array, full: Array, change: Array, valid: Bool
-) -> Callable[..., tuple[Array, Array, float, float]]:
-    def judge(
-        a: Array, delta: Array, full: Array, change: Array, valid: Bool
-    ) -> tuple[Array, Array, float, float]:
-        n = len(delta)
-        residual, weight = delta - robust.times(a, change), np.zeros(n)
-        size = np.empty(n)
-        used, largest = 0, 0.0
-        for i in range(n):
-            if valid[i]:
-                size[used] = abs(residual[i])
-                largest = max(largest, size[used])
-                used += 1
-        scale = residual_scale(robust.median(size[:used]))
-        for i in range(n):
-            weight[i] = full[i] * kept(abs(residual[i]), scale)
-        return residual, weight, scale, largest
-
-    return judge
-
-
-@overload(rings.contour_sums)
-def _contour_sums(
-    view: View, u: Array, v: Array, start: Int, stride: Int, margin_px: float
-) -> Callable[..., tuple[Array, Int]]:
-    def sums(view: View, u: Array, v: Array, start: Int, stride: Int, margin_px: float) -> tuple[Array, Int]:
-        m = len(start) - 1
-        out, count = np.zeros((m, 4)), np.zeros(m, dtype=np.int64)
-        qx, qy = np.empty(len(u)), np.empty(len(u))
-        for i in range(m):
-            first = start[i]
-            n = 0
-            mx, my = 0.0, 0.0
-            for k in range(start[i], start[i + 1], stride[i]):
-                if inside(view, u[k], v[k], margin_px):
-                    x, y = pixel_rays(view, u[k], v[k])
-                    qx[first + n], qy[first + n] = rays_to_plane(view, x, y, v[k])
-                    mx += qx[first + n]
-                    my += qy[first + n]
-                    n += 1
-            count[i] = n
-            if n < MIN_POINTS:
-                continue
-            mx /= n
-            my /= n
-            sxx, syy, sxy, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0
-            for k in range(first, first + n):
-                x, y = qx[k] - mx, qy[k] - my
-                z = x * x + y * y
-                sxx += x * x
-                syy += y * y
-                sxy += x * y
-                sxz += x * z
-                syz += y * z
-            ax, ay = kasa_centre(sxx, syy, sxy, sxz, syz)
-            s1, s2 = 0.0, 0.0
-            for k in range(first, first + n):
-                rho = math.hypot(qx[k] - mx - ax, qy[k] - my - ay)
-                s1 += rho
-                s2 += rho * rho
-            out[i, 0], out[i, 1] = ax + mx, ay + my
-            out[i, 2], out[i, 3] = s1 / n, math.sqrt(max(s2 / n - (s1 / n) ** 2, 0.0))
-        return out, count
-
-    return sums
-
-
-@overload(rings.match_trials)
-def _match_trials(
-    centre: Array,
-    radius: Array,
-    side: Array,
-    weight: Array,
-    unit: Array,
-    circle: Int,
-    edge: Int,
-    edges_m: Array,
-) -> Callable[..., tuple[Array, Int, Bool]]:
-    def match(
-        centre: Array,
-        radius: Array,
-        side: Array,
-        weight: Array,
-        unit: Array,
-        circle: Int,
-        edge: Int,
-        edges_m: Array,
-    ) -> tuple[Array, Int, Bool]:
-        t, m, k = len(circle), len(radius), len(edges_m)
-        score, label, matched = (
-            np.empty(t),
-            np.zeros((t, m), dtype=np.int64),
-            np.zeros((t, m), dtype=np.bool_),
-        )
-        for i in range(t):
-            kappa = radius[circle[i]] / edges_m[edge[i]]
-            cx, cy = centre[circle[i], 0], centre[circle[i], 1]
-            support, n, enclosed = 0.0, 0, False
-            for j in range(m):
-                best = math.inf
-                for e in range(k):
-                    if (e % 2 == 0) == (side[j] > 0.0):
-                        error = abs(kappa * edges_m[e] - radius[j])
-                        if error < best:
-                            best, label[i, j] = error, e
-                apart = math.hypot(cx - centre[j, 0], cy - centre[j, 1])
-                matched[i, j] = is_match(best, apart, radius[j], unit[j])
-                if matched[i, j]:
-                    support += weight[j]
-                    n += 1
-                enclosed |= is_around(apart, radius[j], side[j], unit[j], kappa * edges_m[0])
-            expected = 1e-12
-            for e in range(k):
-                if kappa * edges_m[e] > 1.5 * unit[circle[i]]:
-                    expected += 2.0 * math.pi * kappa * edges_m[e]
-            lonely = n < 2 and not (edge[i] == 0 and radius[circle[i]] < 25.0 * unit[circle[i]])
-            score[i] = 0.0 if lonely or enclosed else support / expected * min(1.0, 0.5 * n)
-        return score, label, matched
-
-    return match
-
-
 @overload(refine.counted)
 def _counted(edge: Int, inlier: Bool, n_edges: int) -> Callable[..., tuple[Array, Array]]:
     def count(edge: Int, inlier: Bool, n_edges: int) -> tuple[Array, Array]:
@@ -623,59 +367,14 @@ def _agreement(
     return judge
 
 
-_REPLACED: set[object] = {
-    view.whole, view.either, robust.masked, robust.median, robust.times, robust.normal_equations, robust.inverted,
-    robust.reweighted,
-    lines.lay_lines, profile.line_moments, profile.line_boxes, profile.solve_lines, profile.displacements,
+REPLACED = (
+    lines.lay_lines,
+    profile.line_boxes,
+    profile.line_moments,
+    profile.solve_lines,
+    profile.displacements,
     profile.line_blurs,
-    profile.crowded, rings.contour_sums, rings.match_trials, refine.counted, refine.agreement,
-    solve_profiles, label_circles,
-}  # fmt: skip
-for _module in _MODULES:
-    for _function in vars(_module).values():
-        if (
-            inspect.isfunction(_function)
-            and _function.__module__ == _module.__name__
-            and _function not in _REPLACED
-        ):
-            register_jitable(_function)
-
-_SOURCES = [Path(inspect.getfile(m)) for m in _MODULES] + [Path(__file__)]
-_solve = jitted(solve_profiles, _SOURCES)
-_label = jitted(label_circles, _SOURCES)
-
-
-def solve(
-    image: Image,
-    view: View,
-    centre: Array,
-    kappa: float,
-    tilt: Array,
-    edges: Edges,
-    tilt_sigma_rad: float,
-    n_lines: int,
-) -> Solution:
-    """Do what ``vision.refine.solve_profiles`` does, for arrays of any layout with one compilation."""
-    frozen = image.view()
-    frozen.flags.writeable = False
-    centre, tilt = np.array(centre, dtype=np.float64), np.array(tilt, dtype=np.float64)
-    found: Solution = _solve(frozen, view, centre, kappa, tilt, edges, tilt_sigma_rad, n_lines)
-    return found
-
-
-def label(
-    view: View, u: Array, v: Array, start: Int, hole: Bool, step_px: float, edges_m: Array, limit: int
-) -> tuple[Array, Bool]:
-    """Do what ``vision.rings.label_circles`` does."""
-    found: tuple[Array, Bool] = _label(view, u, v, start, hole, step_px, edges_m, limit)
-    return found
-
-
-def compile_now() -> None:
-    """Compile, or read from the cache, what has not been yet: so that no frame has to wait for it."""
-    camera = Camera(16, 16, 10.0, 10.0)
-    level = plane.LevelPlane(camera, np.eye(3)).view
-    edges = lines.edges_of(np.array([2.0, 1.0]))
-    solve(np.zeros((16, 16, 3), dtype=np.uint8), level, np.zeros(2), 0.1, np.zeros(2), edges, 0.0, 8)
-    u = np.arange(8.0)
-    label(level, u, u, np.array([0, 8]), np.zeros(1, dtype=np.bool_), 2.0, edges.radius_m, 4)
+    profile.crowded,
+    refine.counted,
+    refine.agreement,
+)
