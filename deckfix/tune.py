@@ -26,7 +26,7 @@ from deckfix.terminal import printable, working
 from deckfix.tune_objective import Refused, Score, Trial, score
 from deckfix.tune_parameters import Parameter, choose, with_values
 from deckfix.tune_report import Tuned, TunedFlight, provenance, report
-from deckfix.tune_search import WORTH, Certainty, Found, Search
+from deckfix.tune_search import EDGE, Certainty, Found, Search
 from estimation.config import Config, dump_config, load_config, parse_config
 from estimation.frames import Array
 
@@ -170,7 +170,7 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
     at_bound = np.zeros(len(centre), dtype=bool)
     found: Found | None = None
     certainty: Certainty | None = None
-    keep = np.ones(len(centre), dtype=bool)
+    keep, answer = np.ones(len(centre), dtype=bool), np.zeros(0)
     evaluations = 0
     while True:
         fixed = tuple((p.name, p.start) for k, p in enumerate(parameters) if k not in free)
@@ -187,12 +187,14 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
             found, certainty = search.certainty(min(ends, key=lambda e: e.value))
         else:
             assert certainty is not None
-            value = float(search.values([point[free]])[0])
-            if value < found.value + WORTH:
-                # What is held now made no difference: the rest is at its best already.
-                found, certainty = Found(point[free], value, 0), certainty.kept(keep)
+            # What is put back was not identified: the others answer to it as the Hessian says.
+            places = [point[free], np.clip(point[free] + answer, lower[free], upper[free])]
+            values = search.values(places)
+            best = int(np.argmin(values))
+            if values[best] < found.value + EDGE * np.count_nonzero(~keep):
+                found, certainty = Found(places[best], float(values[best]), 0), certainty.kept(keep)
             else:
-                found, certainty = search.certainty(search.run(point[free], sweep=False))
+                found, certainty = search.certainty(search.run(places[best], sweep=False))
         evaluations += search.evaluations
         point[free] = found.point
         sigma[:], at_bound[:] = np.inf, False
@@ -200,6 +202,7 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
         keep = certainty.identified | certainty.at_bound
         if keep.all():
             break
+        answer = certainty.answer(keep, centre[free] - point[free])
         free = free[keep]
         if not len(free):
             raise InputError(

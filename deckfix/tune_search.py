@@ -30,6 +30,8 @@ LEAST_STEP, LARGEST_STEP = 0.02, 0.3
 AT_BOUND = 0.01
 ITERATIONS, LEGS, WORTH = 12, 6, 0.5
 """Iterations of L-BFGS-B between which curvatures are taken anew, how often, and the gain below which it ends."""
+EDGE = 5.0
+"""What putting one parameter back that is not identified may cost, before the others are searched for again."""
 KNOWN = math.log(3.0) / 1.96
 """A parameter is identified where its 95 % interval is within a factor of three of it."""
 
@@ -60,6 +62,16 @@ class Certainty:
         """Which parameters the flights tell of."""
         known: NDArray[np.bool_] = (self.sigma < KNOWN) & ~self.at_bound
         return known
+
+    def answer(self, keep: NDArray[np.bool_], shift: Array) -> Array:
+        """Return by how much the best place of some parameters moves when the others are moved by ``shift`` (p,)."""
+        free = keep & ~self.at_bound
+        out = np.zeros(len(self.sigma))
+        H = self.information[np.ix_(free, free)]
+        if free.any() and np.linalg.eigvalsh(H)[0] > 0.0:
+            out[free] = -np.linalg.solve(H, self.information[np.ix_(free, ~keep)] @ shift[~keep])
+        moved: Array = np.clip(out[keep], -0.5, 0.5)
+        return moved
 
     def kept(self, keep: NDArray[np.bool_]) -> Certainty:
         """Return how well some of the parameters are known when the others are held where they are."""

@@ -294,6 +294,22 @@ def test_the_search_finds_noises_and_how_certain_they_are() -> None:
     assert calls == search.evaluations
 
 
+def test_what_is_put_back_moves_the_others_as_the_hessian_says() -> None:
+    H = np.array([[200.0, 3.0, 0.0], [3.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
+    best = np.array([1.0, 0.4, 0.0])
+
+    def objective(points: Sequence[Array]) -> list[float]:
+        return [0.5 * float((p - best) @ H @ (p - best)) for p in points]
+
+    search = Search(objective, np.full(3, -3.0), np.full(3, 3.0), np.zeros(3))
+    found, certainty = search.certainty(search.run(np.zeros(3)))
+    keep = certainty.identified
+    assert keep.tolist() == [True, False, False]
+    shift = -found.point
+    assert certainty.answer(keep, shift) == pytest.approx([3.0 / 200.0 * 0.4], abs=0.003)
+    assert certainty.kept(keep).sigma == pytest.approx([1.0 / np.sqrt(200.0)], rel=0.02)
+
+
 def test_a_parameter_at_its_bound_is_said_to_be_there() -> None:
     def objective(points: Sequence[Array]) -> list[float]:
         return [100.0 * float((p[0] - 5.0) ** 2 + p[1] ** 2) for p in points]
