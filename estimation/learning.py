@@ -34,14 +34,18 @@ LEAST_S = 8.0
 LEAST_SKILL = 0.5
 """Share of the variance half a second ahead that a model must explain before its spectrum's form is taken up; of a
 motion that is foreseen worse only size and speed are."""
+LEAST_SEA = 0.5
+"""Share of the power that must be as fast as a sea's; what is slower is the wander of the vehicle's own height."""
+HIDDEN = 0.5
+"""Density, as a share of the noise's, of a sea that would not be noticed."""
 SETTLING_S, GAP_S = 6.0, 2.0
 """So long after the first fix, and after a gap of the second length, the level is still finding its place [s]."""
 BEFORE_S = 3.0
 """Of the time before a learned heave was let go, so much belongs to what came then [s]."""
-SWAY_S = 16.0
+SWAY_S = 12.0
 """Shortest observation that the sway is learned from [s]."""
-SWAY_EVERY = 5
-"""So many fits of the heave to one of the sway, north and east in turn."""
+SWAY_EVERY = 6
+"""So many fits of the heave to one of the sway, north and then east."""
 SWAY_LOWEST_HZ = 0.07
 """Motion slower than this is the place's drift, and no sway."""
 STILL_M = 0.01
@@ -143,8 +147,8 @@ class MotionLearner:
         if self.model.method == "bhr":
             self._take_heave(self.model)
         if t[-1] - t[0] >= SWAY_S:
-            if self._count % SWAY_EVERY == 0:
-                axis = self._count // SWAY_EVERY % 2
+            axis = self._count % SWAY_EVERY
+            if axis < len(self.sway):
                 place, sigma = seen[:, 2 + 2 * axis], np.sqrt(seen[:, 3 + 2 * axis])
                 self.sway[axis] = fit(t, place, sigma, window_s=self.window_s, previous=self.sway[axis])
                 self._take_sway()
@@ -152,13 +156,18 @@ class MotionLearner:
         return self.model
 
     def _take_heave(self, model: HeaveModel) -> None:
-        if model.sd_m >= STILL_M and float(model.skill(0.5)) >= LEAST_SKILL:
+        sea = float(model.power_m2[2.0 * math.pi * model.frequency_hz >= SEA_RADPS[0]].sum())
+        known = model.sd_m >= STILL_M and float(model.skill(0.5)) >= LEAST_SKILL
+        if known and sea >= LEAST_SEA * float(model.power_m2.sum()):
             self.block = model.band_pass(previous=self.block)
             self.parameters[:HEAVE_PARAMETERS] = self.block.parameters
             return
         self.block = None
-        rate = math.sqrt(model.coefficients.rate_variance_m2ps2)
-        self.parameters[:HEAVE_PARAMETERS] = broad_heave(model.sd_m, rate, float(self._prior[4]))
+        # A sea of less than the noise's density may be there unseen: it adds to size and speed.
+        hidden, top = HIDDEN * model.noise_density_m2ps, SEA_RADPS[1] / (2.0 * math.pi)
+        size = math.sqrt(model.sd_m**2 + hidden * top)
+        rate = math.sqrt(model.coefficients.rate_variance_m2ps2 + hidden * SEA_RADPS[1] ** 2 * top / 3.0)
+        self.parameters[:HEAVE_PARAMETERS] = broad_heave(size, rate, float(self._prior[4]))
 
     def _take_sway(self) -> None:
         """Take size, speed and drift from the models of north and east that there are."""

@@ -1,0 +1,92 @@
+"""What the filter is told of the deck's motion, from where fixes show the deck."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from estimation.config import PlatformConfig
+from estimation.deck import SWAY_EAST, SWAY_NORTH, SWAY_OMEGA, heave_moments, prior_motion
+from estimation.events import Kind
+from estimation.learning import MotionLearner
+from estimation.outcome import Outcome
+from estimation.rows import Rows
+from estimation.watch import LET_GO
+
+Array = NDArray[np.float64]
+RATE_HZ, NOISE_M = 15.0, 0.08
+
+
+def seen(height: Array, north: Array, east: Array, rng: np.random.Generator) -> Rows:
+    n = len(height)
+    rows = Rows.empty(n)
+    rows.t_ns[:] = np.round((100.0 + np.arange(n) / RATE_HZ) * 1e9)
+    rows.kind[:], rows.outcome[:] = Kind.VISION, Outcome.FUSED
+    for column, values in ((0, height), (2, north), (4, east)):
+        rows.seen[:, column] = values + NOISE_M * rng.standard_normal(n)
+        rows.seen[:, column + 1] = NOISE_M**2
+    return rows
+
+
+def learner() -> MotionLearner:
+    return MotionLearner(2.0, 60.0, prior_motion(PlatformConfig()))
+
+
+def told(parameters: Array) -> tuple[float, float]:
+    """Return the 1-sigma of the heave and of its rate that parameters mean."""
+    moments = heave_moments(parameters[:7])
+    return math.sqrt(moments[3]), math.sqrt(moments[4])
+
+
+def sea(t: Array, sigma_m: float, period_s: float, rng: np.random.Generator) -> Array:
+    """Return a narrow sea: five sinusoids about a period."""
+    omega = 2.0 * np.pi / (period_s * rng.uniform(0.85, 1.15, 5))
+    phase = rng.uniform(0.0, 2.0 * np.pi, 5)
+    out: Array = sigma_m * math.sqrt(2.0 / 5.0) * np.sin(np.outer(t, omega) + phase).sum(axis=1)
+    return out
+
+
+def test_a_sea_is_taken_up_in_its_form_and_both_axes_of_the_sway_soon() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 16.0, 1.0 / RATE_HZ)
+    one = learner()
+    one.take(seen(sea(t, 0.2, 5.0, rng), sea(t, 0.15, 5.0, rng), sea(t, 0.02, 5.0, rng), rng))
+    size, rate = told(one.parameters)
+    assert one.block is not None
+    assert size == pytest.approx(0.2, rel=0.5) and rate / size == pytest.approx(2.0 * math.pi / 5.0, rel=0.3)
+    assert all(m is not None for m in one.sway)
+    assert one.parameters[SWAY_NORTH] > 2.0 * one.parameters[SWAY_EAST]
+    assert one.parameters[SWAY_OMEGA] == pytest.approx(2.0 * math.pi / 5.0, rel=0.5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_small_sea_under_the_wander_of_the_own_height_is_not_taken_for_slow(seed: int) -> None:
+    """Noise hides most of it: what is told must leave room for the rate that it may have."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 36.0, 1.0 / RATE_HZ)
+    wander = 0.04 * np.sin(2.0 * np.pi * t / 25.0 + rng.uniform(0.0, 6.0))
+    one = learner()
+    one.take(seen(wander + sea(t, 0.02, 2.0, rng), 0.0 * t, 0.0 * t, rng))
+    true_rate = 0.02 * 2.0 * math.pi / 2.0
+    assert told(one.parameters)[1] > 0.6 * true_rate
+    assert told(one.parameters)[0] < 0.12
+
+
+def test_what_came_before_a_letting_go_is_not_learned_from() -> None:
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 34.0, 1.0 / RATE_HZ)
+    height = np.where(t < 20.0, 0.0, sea(t, 0.4, 6.0, rng))
+    rows = seen(height, 0.0 * t, 0.0 * t, rng)
+    one = learner()
+    one.take(rows.take(slice(0, int(21.0 * RATE_HZ))))
+    small = told(one.parameters)[0]
+    rest = rows.take(slice(int(21.0 * RATE_HZ), None))
+    rest.reset[0] = LET_GO
+    fits = one.take(rest)
+    assert small < 0.2
+    # Nothing until eight seconds of the new motion were seen; and then it is not diluted by the old.
+    assert fits[0][0] * 1e-9 >= 100.0 + 21.0 - 3.0 + 8.0
+    assert 0.3 < told(one.parameters)[0] < 0.8
