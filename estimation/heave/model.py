@@ -128,6 +128,7 @@ class HeaveModel:
     def dominant_period_s(self) -> float:
         """Period of the one sinusoid (and constant) that explains most of the motion in the window [s].
 
+        Its amplitude may grow or fall with time, linearly: a swell that sets in would else look longer than it is.
         Sharper than ``tp_s`` for a deck that moves regularly; on an irregular sea it is that of the highest
         group of waves. Searched between 0.5 and 2 times the frequency of ``tp_s``; NaN without motion.
         """
@@ -138,9 +139,10 @@ class HeaveModel:
         basis, mean = self.coefficients.basis, self.coefficients.mean
         motion = basis.values(time)[:, ~self.coefficients.level] @ mean[~self.coefficients.level]
         frequency = np.geomspace(0.5, 2.0, 400) / centre
-        explained = np.zeros(len(frequency))
+        explained, growth = np.zeros(len(frequency)), time[:, None] / self.span_s + 0.5
         for k, hz in enumerate(frequency):
             columns = Basis(np.array([hz])).values(time)
+            columns = np.hstack([columns, growth * columns[:, :2]])
             explained[k] = (columns.T @ motion) @ np.linalg.lstsq(columns, motion, rcond=None)[0]
         k = int(np.clip(np.argmax(explained), 1, len(frequency) - 2))
         before, at, after = explained[k - 1 : k + 2]

@@ -69,6 +69,14 @@ def test_period_is_found_within_fifteen_seconds() -> None:
         assert model.dominant_period_s == pytest.approx(7.0, rel=0.03)
 
 
+def test_the_period_of_a_swell_that_sets_in_is_not_too_long() -> None:
+    rng = np.random.default_rng(21)
+    t = np.arange(0.0, 15.0, 1.0 / 18.0)
+    value = 0.6 * (1.0 - np.exp(-((t / 5.0) ** 2))) * np.sin(2.0 * np.pi * t / 7.0)
+    model = heave.fit(t, value + 0.12 * rng.standard_normal(len(t)), 0.12, window_s=60.0)
+    assert model.dominant_period_s == pytest.approx(7.0, rel=0.03)
+
+
 def test_one_sinusoid_by_least_squares_is_found_exactly() -> None:
     model, last = fit_swell(method="sinusoids", components=1)
     (component,) = model.components
