@@ -184,7 +184,9 @@ def main() -> None:
                 flown += found[guide]["landings"]
             print(line(guide, found[guide]), dict(Counter(f.end for f in chosen)), flush=True)
         print(f"  {time.perf_counter() - begin:.0f} s", flush=True)
-        document[sea] = found
+        # Each contact's speed and miss, so that runs with other seeds can be put together.
+        contacts = {g: [[one[g].speed_mps, one[g].miss_m] for one in flights] for g in arguments.guide}
+        document[sea] = {"summary": found, "contacts": contacts}
         if sea != "Beaufort 0" and {"deckfix", "blind"} <= found.keys():
             ratios = {k: found["deckfix"][k] / found["blind"][k] for k in ("speed_median", "speed_p95")}
             print("  contact speed over blind: " + ", ".join(f"{k} {v:.2f}" for k, v in ratios.items()))

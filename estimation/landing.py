@@ -45,6 +45,8 @@ CONTACT_SPREAD_S = 0.3
 LONGEST_DESCENT = 4.0
 """A last descent that takes longer than this multiple of what it should take is broken off."""
 STATION_M = 3.0
+MOST_LOSSES = 6
+"""A target that was lost so often, in tracking or observation, is no target."""
 FASTEST_DRIFT_MPS = 0.5
 """A platform on its anchor drifts no faster."""
 LEFT_PROBABILITY = 0.5
@@ -139,6 +141,7 @@ class Progress:
     ``since_ns`` is the begin of the mode, ``met_ns`` since when the condition for going on has held, ``descent_ns``
     the begin of the last descent (None: not yet), ``station_ns`` the arrival over the anchor, ``attempts`` the aborts.
     ``rate_power_m2ps2`` is the mean square of the deck's rate over the ``rate_count`` steps of the observation.
+    ``losses`` counts how often the target was lost again before a landing.
     ``drift_mps`` north and east is how fast the place drifts that is to be kept, ``stepped_ns`` when that was last
     corrected.
     """
@@ -153,6 +156,7 @@ class Progress:
     yaw_rad: float = 0.0
     rate_power_m2ps2: float = 0.0
     rate_count: int = 0
+    losses: int = 0
     drift_mps: tuple[float, float] = (0.0, 0.0)
     stepped_ns: int | None = None
 
@@ -276,7 +280,7 @@ def _search(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Prog
 
 def _tracking(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Progress:
     if seen.detection_age_s > c.lost_s:
-        return _enter(p, Mode.SEARCH, Reason.TARGET_LOST, seen)
+        return _lost(p, seen)
     altitude = c.track_share * search_altitude_m(c)
     off = abs(-e.position_m[2] - e.nominal[PL0] - altitude)
     aligned = (
@@ -290,7 +294,7 @@ def _tracking(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pr
 
 def _observation(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Progress:
     if seen.detection_age_s > c.lost_s:
-        return _enter(p, Mode.SEARCH, Reason.TARGET_LOST, seen)
+        return _lost(p, seen)
     if _inside(e, c.r_track_m) < LEFT_PROBABILITY:
         return _enter(p, Mode.TRACKING, Reason.OUTSIDE_R_TRACK, seen)
     power = float(e.deck[7] ** 2 + e.deck_covariance[7, 7])
@@ -362,7 +366,14 @@ def _enter(p: Progress, mode: Mode, reason: Reason, seen: Situation) -> Progress
 
 
 def _abort(p: Progress, reason: Reason, seen: Situation) -> Progress:
-    return replace(_enter(p, Mode.ABORT, reason, seen), attempts=p.attempts + 1)
+    return replace(_enter(p, Mode.ABORT, reason, seen), attempts=p.attempts + 1, losses=0)
+
+
+def _lost(p: Progress, seen: Situation) -> Progress:
+    """Search for a target that was lost; one that is lost again and again uses up an attempt."""
+    if p.losses + 1 >= MOST_LOSSES:
+        return _abort(p, Reason.TARGET_LOST, seen)
+    return replace(_enter(p, Mode.SEARCH, Reason.TARGET_LOST, seen), losses=p.losses + 1)
 
 
 def _holding(p: Progress, met: bool, seen: Situation) -> Progress:

@@ -191,6 +191,12 @@ def test_a_lost_target_is_searched_for_again() -> None:
     for mode in (Mode.TRACKING, Mode.OBSERVATION):
         seen = Situation(10**9, estimate(10**9, (0.0, 0.0, -7.0)), 1.5)
         assert step(Progress(mode), seen, c)[1].mode is Mode.SEARCH
+    p = Progress(Mode.TRACKING)
+    for _ in range(100):
+        if p.mode is Mode.ABORT:
+            break
+        p = step(replace(p, mode=Mode.TRACKING), seen, c)[0]
+    assert (p.reason, p.attempts) == (Reason.TARGET_LOST, 1)
     p = Progress(Mode.ABORT, Reason.TARGET_LOST, attempts=1)
     low = Situation(10**9, estimate(10**9, (0.0, 0.0, -1.0)), 1.5)
     assert step(p, low, c)[1].mode is Mode.ABORT

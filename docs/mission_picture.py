@@ -1,6 +1,6 @@
 """The README's picture of the demo: height, place and view of one landing, from the files that ``deckfix demo`` wrote.
 
-    python benchmarks/mission_picture.py [demo] [-o docs/images/mission.png]
+    python docs/mission_picture.py [demo] [-o docs/images/mission.png]
 
 Needs matplotlib (part of ``pip install .[dev]``).
 """
@@ -48,6 +48,7 @@ def modes(flight: Any) -> list[tuple[float, float, Mode]]:
 
 
 def main() -> int:
+    """Draw the picture."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", nargs="?", type=Path, default=Path("demo"))
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/images/mission.png"))
