@@ -78,6 +78,22 @@ def test_noises_are_found_again_and_the_file_says_how(flights: list[str], tmp_pa
     assert not target.with_name(target.name + STATE).exists()
 
 
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_starts_that_are_wrong_by_ten_end_at_what_was_drawn(
+    factor: float, flights: list[str], tmp_path: Path
+) -> None:
+    drawn = {"gps.velocity_sigma_mps": 0.1, "gps.position_sigma_m": 0.3, "barometer.sigma_m": 0.125}
+    start = tmp_path / "start.toml"
+    start.write_text(dump_config(with_values(Config(), [(n, factor * v) for n, v in drawn.items()])))
+    options = dataclasses.replace(OPTIONS, config=str(start), parameters=tuple(drawn))
+    _, written = run_tune(flights[:1], flights[1:2], tmp_path / "c.toml", options)
+    assert written
+    config = load_config(tmp_path / "c.toml")
+    for name, value in drawn.items():
+        table, key = name.split(".")
+        assert value / 1.5 < getattr(getattr(config, table), key) < value * 1.5, name
+
+
 def test_what_is_worse_on_the_flights_held_out_is_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
