@@ -141,8 +141,8 @@ def main() -> None:
             print(f" (n {forecast[0]['count']})")
         for r in forecast:
             label = f"{name}: coverage at {r['horizon_s']:g} s"
-            targets.add(Target(label, r["coverage_95"], COVERAGE[0], at_least=True))
-            targets.add(Target(label, r["coverage_95"], COVERAGE[1]))
+            targets.add(Target(f"{label}, at least", r["coverage_95"], COVERAGE[0], at_least=True))
+            targets.add(Target(f"{label}, at most", r["coverage_95"], COVERAGE[1]))
         document[name] = row
     met = targets.report()
     document["targets"] = targets.as_rows()

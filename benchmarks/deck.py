@@ -132,8 +132,8 @@ def judged(name: str, folder: Path, deck: Deck, scratch: Path, latency: bool, ta
     if name == "sea3a":
         row["forecast"] = forecast_table(result, deck, int(contact))
         pooled = float(np.mean([entry["coverage_95"] for entry in row["forecast"]]))
-        targets.add(Target(f"{name}: coverage of the forecasts, all horizons", pooled, 0.92, True))
-        targets.add(Target(f"{name}: coverage of the forecasts, all horizons", pooled, 0.98))
+        targets.add(Target(f"{name}: coverage of the forecasts, all horizons, at least", pooled, 0.92, True))
+        targets.add(Target(f"{name}: coverage of the forecasts, all horizons, at most", pooled, 0.98))
     if name == "calm":
         row["constant"] = constants(run, (t > first + 20_000_000_000) & (t < contact))
         for key, value in row["constant"].items():
