@@ -271,6 +271,7 @@ LOOKS = {
     "second renderer, no lens blur": Look(spread_px=0.0),
     "second renderer, clipped white": Look(light=1.5),
     "second renderer, gamma 2.2": Look(gamma=2.2),
+    "second renderer, JPEG quality 85": Look(jpeg=85),
     "second renderer, motion 4 px": Look(motion_px=4.0, motion_angle_rad=0.6),
 }
 
@@ -415,27 +416,31 @@ def times(frames: int, targets: Targets) -> dict[str, Any]:
     for height in (2.0, 5.0, 10.0):
         rng = np.random.default_rng(int(height) + 3)
         places = list(poses(rng, height, frames))
-        cell: dict[str, Any] = {}
-        spreads: dict[str, float] = {}
-        for label, marker in (("ArUco", aruco), (tag_name, tag)):
-            drawn = MarkerRenderer(CAMERA, marker.bits, SIDE_M, 1.3 * SIDE_M)
-            images = [drawn.render(R_nc, -R_nc @ truth, rng, NOISE) for R_nc, truth in places]
-            taken = [cpu_ms(lambda i=i, m=marker: m.corners(i), 7) for i in images]
-            cell[label], spreads[label] = float(np.median(taken)), relative_spread(taken)
-        for name, target in TARGETS.items():
-            renderer, detector = Renderer(CAMERA, target), TargetDetector(CAMERA, target)
-            full, tracked = [], []
-            for R_nc, truth in places:
+        taken: dict[str, list[float]] = {}
+        markers = [
+            (label, marker, MarkerRenderer(CAMERA, marker.bits, SIDE_M, 1.3 * SIDE_M))
+            for label, marker in (("ArUco", aruco), (tag_name, tag))
+        ]
+        rings = [
+            (name, Renderer(CAMERA, target), TargetDetector(CAMERA, target))
+            for name, target in TARGETS.items()
+        ]
+        # All of a frame one after the other, so that a processor that slows down slows all.
+        for R_nc, truth in places:
+            for label, marker, drawn in markers:
+                image = drawn.render(R_nc, -R_nc @ truth, rng, NOISE)
+                least = cpu_ms(lambda i=image, m=marker: m.corners(i), 7)
+                taken.setdefault(label, []).append(least)
+            for name, renderer, detector in rings:
                 image = renderer.render(R_nc, -R_nc @ truth, rng, NOISE)
                 prior = truth * (1.0 + 0.002 * rng.standard_normal(3))
-                full.append(cpu_ms(lambda i=image, r=R_nc, d=detector: d.detect(i, r), 7))
-                tracked.append(cpu_ms(lambda i=image, r=R_nc, d=detector, p=prior: d.detect(i, r, p), 7))
-            cell[f"{name}: full"] = float(np.median(full))
-            cell[f"{name}: tracked"] = float(np.median(tracked))
-            spreads[f"{name}: full"], spreads[f"{name}: tracked"] = (
-                relative_spread(full),
-                relative_spread(tracked),
-            )
+                full = cpu_ms(lambda i=image, r=R_nc, d=detector: d.detect(i, r), 7)
+                tracked = cpu_ms(lambda i=image, r=R_nc, d=detector, p=prior: d.detect(i, r, p), 7)
+                taken.setdefault(f"{name}: full", []).append(full)
+                taken.setdefault(f"{name}: tracked", []).append(tracked)
+        cell: dict[str, Any] = {name: float(np.median(values)) for name, values in taken.items()}
+        spreads = {name: relative_spread(values) for name, values in taken.items()}
+        for name in TARGETS:
             for limit, label, key in (
                 (1.0 / 3.0, "ArUco", "full"),
                 (1.0 / 10.0, tag_name, "full"),

@@ -71,7 +71,7 @@ class TargetDetector:
     engine
         ``"compiled"`` (needs numba), ``"numpy"``, or ``"auto"``: compiled where numba is installed. The fixes
         are the same; compiled, they take a fraction of the time, but the very first detector on a machine
-        waits about a minute for the compiler (the result is kept in the user's cache folder).
+        waits a minute or two for the compiler (the result is kept in the user's cache folder).
 
     Raises ``ValueError`` naming the argument.
     """
