@@ -22,6 +22,8 @@ Method = Literal["bhr", "sinusoids", "mean"]
 
 SHORTEST_SPAN_S = 5.0
 FEWEST_BINS = 16
+GROWTHS = (-2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
+"""Change of the dominant sinusoid's amplitude over the window, in its mean: from dying out to setting in."""
 
 
 class Component(NamedTuple):
@@ -128,7 +130,8 @@ class HeaveModel:
     def dominant_period_s(self) -> float:
         """Period of the one sinusoid (and constant) that explains most of the motion in the window [s].
 
-        Its amplitude may grow or fall with time, linearly: a swell that sets in would else look longer than it is.
+        Its amplitude may grow or fall with time, linearly and in phase: a swell that sets in would else look longer
+        than it is. (A part in quadrature that grows would be another frequency.)
         Sharper than ``tp_s`` for a deck that moves regularly; on an irregular sea it is that of the highest
         group of waves. Searched between 0.5 and 2 times the frequency of ``tp_s``; NaN without motion.
         """
@@ -139,11 +142,7 @@ class HeaveModel:
         basis, mean = self.coefficients.basis, self.coefficients.mean
         motion = basis.values(time)[:, ~self.coefficients.level] @ mean[~self.coefficients.level]
         frequency = np.geomspace(0.5, 2.0, 400) / centre
-        explained, growth = np.zeros(len(frequency)), time[:, None] / self.span_s + 0.5
-        for k, hz in enumerate(frequency):
-            columns = Basis(np.array([hz])).values(time)
-            columns = np.hstack([columns, growth * columns[:, :2]])
-            explained[k] = (columns.T @ motion) @ np.linalg.lstsq(columns, motion, rcond=None)[0]
+        explained = np.max([_explained(motion, time, frequency, growth) for growth in GROWTHS], axis=0)
         k = int(np.clip(np.argmax(explained), 1, len(frequency) - 2))
         before, at, after = explained[k - 1 : k + 2]
         bend = before - 2.0 * at + after
@@ -344,3 +343,17 @@ def _of_spectrum(window: Window, learned: LearnedSpectrum, settings: SpectrumSet
         max(float(learned.power_m2 @ omega**2), float(np.mean(rate**2))),
         settings.horizon_s + 0.5 * grid_span(window),
     )
+
+
+def _explained(motion: Array, time: Array, frequency: Array, growth: float) -> Array:
+    """Return how much of motion (n,) at times (n,) [s] a sinusoid whose amplitude grows, and a constant, explain: for
+    each frequency (f,) [Hz] the squared length of its projection, (f,).
+    """
+    envelope = 1.0 + growth * ((time - time.mean()) / (time.max() - time.min()))
+    angle = 2.0 * np.pi * frequency[:, None] * time
+    columns = np.stack([envelope * np.cos(angle), envelope * np.sin(angle), np.ones_like(angle)], axis=1)
+    right = columns @ motion
+    out: Array = np.sum(
+        right * np.linalg.solve(columns @ columns.swapaxes(1, 2), right[..., None])[..., 0], axis=1
+    )
+    return out

@@ -15,8 +15,10 @@ from deckfix.files import OutputError
 from deckfix.intake import MOST_EVENTS, CompanionClock, Intake
 from deckfix.pipeline import ImageEvent, Pipeline
 from deckfix.recorder import Recorder, log_path
-from deckfix.replaying import replay
+from deckfix.replaying import CONFIG_NAME, replay
+from estimation.config import Config, dump_config
 from estimation.events import COMPANION, Imu, VisionFix
+from estimation.output import with_platform
 from logs import open_flight
 from logs.errors import LogError
 from logs.writer import FlightWriter
@@ -29,8 +31,11 @@ def image(arrival_ns: int, side: int = 64) -> ImageEvent:
 
 
 def begun(path: Path) -> tuple[Recorder, Pipeline]:
-    pipeline = Pipeline(engine="filterpy")
-    made = Recorder(path, pipeline.estimator, {})
+    """Begin a log with the configuration that is flown: without a camera, whatever fixes may come."""
+    config = with_platform(Config(), False)
+    pipeline = Pipeline(config, engine="filterpy")
+    own = {CONFIG_NAME: ("application/toml", dump_config(config).encode())}
+    made = Recorder(path, pipeline.estimator, own)
     made.begin()
     return made, pipeline
 
