@@ -56,7 +56,7 @@ ALL = (
     Benchmark("clock", "clock layer", ("--trials", "40"), ("--trials", "400")),
     Benchmark("latency", "the camera's latency", ("--flights", "4", "--offline", "1")),
     Benchmark("ship_section", "real heave and a real camera's offset"),
-    Benchmark("rings", "vision against ArUco and AprilTag", ("--frames", "10"), ("--full",)),
+    Benchmark("rings", "vision against ArUco and AprilTag", ("--frames", "10", "--baseline"), ("--full", "--baseline")),
     Benchmark("thesis", "the thesis's method", ("--quick",)),
     Benchmark("rendering", "frames a second of the renderer", ("--frames", "10")),
     Benchmark("read_columns", "reading columns over the mcap reader", ("--duration", "60")),
