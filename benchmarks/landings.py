@@ -31,7 +31,8 @@ from joblib import Parallel, delayed
 from targets import Target, Targets, provenance
 
 from estimation.config import LandingConfig
-from estimation.landing import Decision, Mode, Progress, Reason, Situation, step
+from estimation.landing import step
+from estimation.modes import Decision, Mode, Progress, Reason, Situation
 from simulation.flight import WavesTable
 from simulation.mission import Mission, load_mission
 from simulation.sea import Wave

@@ -79,7 +79,7 @@ def run_demo(folder: str | Path, *, seed: int = 1, force: bool = False) -> str:
     """
     from deckfix.rendered import fly_rendered, write_rendered
     from deckfix.replaying import replay
-    from estimation.landing import EXPLANATIONS
+    from estimation.modes import EXPLANATIONS
     from simulation.mission import load_mission
 
     target = output_folder(folder)

@@ -150,7 +150,7 @@ def landing(result: Result) -> Row:
 
 
 def _last_mode(flight: Flight) -> str:
-    from estimation.landing import Mode
+    from estimation.modes import Mode
     from logs.errors import LogError
 
     last = ""

@@ -16,7 +16,8 @@ from deckfix.landing_target import Newest
 from deckfix.mavlink_link import GUIDED, Vehicle
 from estimation.ahead import DeckForecast
 from estimation.config import LandingConfig
-from estimation.landing import EXPLANATIONS, Decision, Mode, Progress, Situation, step
+from estimation.landing import step
+from estimation.modes import EXPLANATIONS, Decision, Mode, Progress, Situation
 
 LOCAL_NED = 1
 VELOCITY_AND_YAW = 0b0000_1001_1100_0111

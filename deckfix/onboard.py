@@ -29,7 +29,7 @@ from deckfix.stream_requests import StreamRequests
 from estimation.ahead import DeckForecaster
 from estimation.clockbank import ClockSummary
 from estimation.events import Event, Imu, Kind, TimeSync
-from estimation.landing import Mode
+from estimation.modes import Mode
 from estimation.state import BG0
 
 TIMESYNC_S = 0.15

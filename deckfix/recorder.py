@@ -25,7 +25,7 @@ from deckfix.forecasts import forecasts
 from deckfix.pipeline import ImageEvent, Step
 from estimation.estimator import LandingEstimator
 from estimation.events import AUTOPILOT, COMPANION, EVENT_DTYPE, EventBatch, Names, pack
-from estimation.landing import Decision
+from estimation.modes import Decision
 from estimation.output import RECORD_DTYPE, Estimate, Run
 from estimation.state import BA0, BG0, P0, Q0, V0
 from logs.errors import LogError

@@ -20,7 +20,7 @@ from estimation.config import ConfigError
 from estimation.estimator import EngineName, LandingEstimator
 from estimation.events import EventBatch, VisionFix
 from estimation.frames import Array
-from estimation.landing import Decision
+from estimation.modes import Decision
 from estimation.output import Estimate
 from logs.images import TOPIC
 from logs.writer import FlightWriter

@@ -16,7 +16,7 @@ import numpy as np
 
 import deckfix
 from deckfix.pipeline import decode
-from estimation.landing import Mode
+from estimation.modes import Mode
 from logs.images import images
 
 SHADES = {

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.events import AUTOPILOT
-from estimation.landing import Decision
+from estimation.modes import Decision
 from logs.recording import Series
 from logs.topics import TOPICS, new_rows
 

@@ -35,7 +35,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.landing import Mode
+from estimation.modes import Mode
 from estimation.outcome import EXPLANATIONS, Outcome
 from logs.cdr import Given, layout
 from logs.definition import Definition, parse, short_name

@@ -31,7 +31,7 @@ from estimation.events import (
     TimeSync,
 )
 from estimation.frames import Array, quat_exp, quat_multiply, quat_to_matrix
-from estimation.landing import Decision, Progress, Situation
+from estimation.modes import Decision, Progress, Situation
 from simulation import vehicle as body
 from simulation.instruments import Instant
 from simulation.mission import Mission

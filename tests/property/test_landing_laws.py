@@ -12,17 +12,9 @@ from hypothesis import strategies as st
 from estimation.ahead import DeckForecast
 from estimation.config import LandingConfig
 from estimation.frames import euler_to_quat
-from estimation.landing import (
-    EXPLANATIONS,
-    Mode,
-    Progress,
-    Reason,
-    Situation,
-    deck_rate_ahead,
-    inside_probability,
-    search_altitude_m,
-    step,
-)
+from estimation.guidance import deck_rate_ahead, inside_probability, search_altitude_m
+from estimation.landing import step
+from estimation.modes import EXPLANATIONS, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
 from estimation.state import NOMINAL_SIZE, Q0
 

@@ -11,18 +11,9 @@ import pytest
 from estimation.ahead import DeckForecast
 from estimation.config import Config, ConfigError, LandingConfig, parse_config
 from estimation.frames import euler_to_quat
-from estimation.landing import (
-    EXPLANATIONS,
-    Decision,
-    Mode,
-    Progress,
-    Reason,
-    Situation,
-    descent_rate,
-    search_altitude_m,
-    step,
-    time_to_contact,
-)
+from estimation.guidance import descent_rate, search_altitude_m, time_to_contact
+from estimation.landing import step
+from estimation.modes import EXPLANATIONS, Decision, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
 from estimation.state import NOMINAL_SIZE
 from logs.estimates import landing_series

@@ -17,7 +17,7 @@ from deckfix.landing_target import AHEAD_S, Newest, landing_target, target_in_bo
 from deckfix.mavlink_link import GUIDED, LAND, Vehicle
 from estimation.config import LandingConfig
 from estimation.frames import euler_to_quat, quat_to_matrix
-from estimation.landing import Mode
+from estimation.modes import Mode
 from estimation.output import Estimate
 from estimation.state import NOMINAL_SIZE
 

@@ -12,7 +12,8 @@ import pytest
 from deckfix.demo import simulate_flight
 from estimation.config import ConfigError
 from estimation.events import Kind
-from estimation.landing import Mode, step
+from estimation.landing import step
+from estimation.modes import Mode
 from logs import open_flight
 from simulation.mission import load_mission, mission_names, parse_mission
 from simulation.sensors import Clock

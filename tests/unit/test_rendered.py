@@ -12,7 +12,7 @@ from deckfix.rendered import Companion, fly_rendered, write_rendered
 from estimation.config import ConfigError
 from estimation.events import Kind
 from estimation.frames import quat_to_matrix
-from estimation.landing import Mode
+from estimation.modes import Mode
 from logs import open_flight
 from logs.images import images
 from simulation.fixes import seen_from

@@ -1,0 +1,202 @@
+"""What a landing mode flies, and what it judges by: velocities relative to the deck, probabilities of the circles.
+
+The constraints of the seed are kept as probabilities under the estimate's covariance: (3.5) and (3.7) ask how probable
+it is that the vehicle is inside the circle. The descent is relative to the deck: the rate asked for is the deck's own,
+forecast by the vehicle's lag, less a descent that never exceeds 0.5 m/s.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimation.ahead import DeckForecast
+from estimation.config import LandingConfig
+from estimation.frames import Array, quat_to_matrix
+from estimation.modes import Decision, Mode, Progress, Reason, Situation
+from estimation.state import PL0
+
+if TYPE_CHECKING:
+    from estimation.output import Estimate
+
+CONTACT_SPREAD_S = 0.3
+"""A quiet moment lasts from this long before the contact expected until this long after it."""
+
+
+def search_altitude_m(c: LandingConfig) -> float:
+    """Return the altitude that the platform is searched from: the configured one, or seed (3.4).
+
+    ceil((r_anchor + H_error) / tan(FOV / 2) + V_error). The seed's example (15 m, 2 m, 50 deg, 5 m) gives 42 m, not
+    the 34 m printed there.
+    """
+    if c.search_altitude_m is not None:
+        return c.search_altitude_m
+    reach = c.anchor_radius_m + c.gps_horizontal_error_m
+    return float(math.ceil(reach / math.tan(0.5 * c.field_of_view_rad) + c.gps_vertical_error_m))
+
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+def inside_probability(mean: Array, covariance: Array, radius: float) -> float:
+    """Return the probability that a Gaussian (2,), (2, 2) lies inside the circle about the origin.
+
+    Exact along one principal axis of the covariance, by quadrature along the other; good to 1e-6 for sigmas above a
+    hundredth of the radius, and right in the limit of a point.
+    """
+    from scipy.special import ndtr
+
+    if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(covariance))):
+        return 0.0
+    # Certain where the circle's edge is seven sigmas away, which is most of the time.
+    a, b, c = float(covariance[0, 0]), float(covariance[1, 1]), float(covariance[0, 1])
+    largest = 0.5 * (a + b) + math.hypot(0.5 * (a - b), c)
+    if radius - math.hypot(mean[0], mean[1]) > 7.0 * math.sqrt(max(largest, 0.0)):
+        return 1.0
+    values, axes = np.linalg.eigh(covariance)
+    m = axes.T @ mean
+    sigma = np.sqrt(np.maximum(values, (1e-6 * radius) ** 2))
+    # Across the larger sigma the integrand is a difference of error functions, along it a Gaussian cut at 8 sigma.
+    low, high = max(-radius, m[1] - 8.0 * sigma[1]), min(radius, m[1] + 8.0 * sigma[1])
+    if not high > low:
+        return 0.0
+    # Four pieces of 24 nodes each.
+    ends = np.linspace(low, high, 5)
+    middle, half = 0.5 * (ends[1:] + ends[:-1]), 0.5 * (ends[1:] - ends[:-1])
+    y = (middle[:, None] + half[:, None] * _NODES).ravel()
+    weights = (half[:, None] * _WEIGHTS).ravel()
+    reach = np.sqrt(np.maximum(radius**2 - y**2, 0.0))
+    density = np.exp(-0.5 * ((y - m[1]) / sigma[1]) ** 2) / (sigma[1] * math.sqrt(2.0 * math.pi))
+    inner = ndtr((reach - m[0]) / sigma[0]) - ndtr((-reach - m[0]) / sigma[0])
+    return min(1.0, max(0.0, float(weights @ (density * inner))))
+
+
+# -- what is judged ------------------------------------------------------------------------------------------------
+
+
+def unfit(seen: Situation, c: LandingConfig) -> Reason | None:
+    """Return why the estimate cannot be flown on, or None."""
+    e = seen.estimate
+    if e is None or (seen.now_ns - e.t_ns) * 1e-9 > c.stale_s:
+        return Reason.ESTIMATE_STALE
+    known = (e.position_m, e.velocity_mps, e.quaternion, e.covariance, e.deck, e.deck_covariance)
+    if not all(bool(np.all(np.isfinite(part))) for part in known):
+        return Reason.ESTIMATE_UNSURE
+    if max(e.covariance[0, 0], e.covariance[1, 1]) > c.sigma_limit_m**2:
+        return Reason.ESTIMATE_UNSURE
+    return None
+
+
+def probably_inside(e: Estimate, radius: float) -> float:
+    """Return the probability of being within a radius [m] of the target, horizontally."""
+    return inside_probability(e.deck[:2], e.deck_covariance[:2, :2], radius)
+
+
+def tilt_rad(e: Estimate) -> float:
+    """Return the angle [rad] between the vehicle's vertical and the world's."""
+    return math.acos(max(-1.0, min(1.0, float(quat_to_matrix(e.quaternion)[2, 2]))))
+
+
+def heading_rad(e: Estimate) -> float:
+    """Return the heading [rad] from north, clockwise."""
+    R = quat_to_matrix(e.quaternion)
+    return math.atan2(float(R[1, 0]), float(R[0, 0]))
+
+
+def probably_quiet(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -> float:
+    """Return the probability of a quiet deck at the contact that a descent begun now would lead to."""
+    if forecast is None:
+        return 0.0
+    contact = time_to_contact(-float(e.deck[2]), c)
+    return forecast.quiet_probability(
+        contact - CONTACT_SPREAD_S, contact + CONTACT_SPREAD_S, c.quiet_rate_mps
+    )
+
+
+# -- guidance ------------------------------------------------------------------------------------------------------
+
+
+def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
+    """Return what a landing that is at ``p`` flies now."""
+    e = seen.estimate
+    nan = math.nan
+    climb = np.array([0.0, 0.0, -c.climb_mps])
+    if p.mode in (Mode.IDLE, Mode.LANDED):
+        return Decision(p.mode, p.reason, np.zeros(3), p.yaw_rad, c.land_tilt_rad, np.zeros(3), nan, nan)
+    if e is None or unfit(seen, c) is not None:
+        # Nothing relative to the deck can be trusted: straight up, on the autopilot's own estimate.
+        return Decision(p.mode, p.reason, climb, p.yaw_rad, c.track_tilt_rad, np.full(3, nan), nan, nan)
+    if p.mode in (Mode.SEARCH, Mode.ABORT):
+        high = search_altitude_m(c)
+        aim = np.array([0.0, 0.0, -high])
+        velocity = np.empty(3)
+        velocity[:2] = _towards(-e.position_m[:2], c.speed_mps, c.position_gain)
+        velocity[2] = _vertical(-high - float(e.position_m[2]), c)
+        if p.mode is Mode.ABORT and p.reason is not Reason.GIVEN_UP:
+            velocity = climb
+        return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.track_tilt_rad, aim, nan, nan)
+    velocity = np.empty(3)
+    velocity[:2] = sway_ahead(e, seen.forecast, c.response_level_s)
+    velocity[:2] += p.drift_mps
+    velocity[:2] += _towards(-e.deck[:2], c.speed_mps, c.position_gain)
+    if p.mode is not Mode.LANDING:
+        altitude = c.track_share * search_altitude_m(c)
+        aim = np.array([0.0, 0.0, -altitude])
+        velocity[2] = _vertical(-altitude - float(e.nominal[PL0]) - float(e.position_m[2]), c)
+        inside = probably_inside(e, c.r_track_m)
+        return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.track_tilt_rad, aim, inside, nan)
+    height = -float(e.deck[2])
+    if p.descent_ns is None:
+        aim = np.array([0.0, 0.0, -c.hold_height_m])
+        wanted = c.position_gain * (height - c.hold_height_m)
+        descent = min(c.approach_rate_mps, max(-c.climb_mps, wanted))
+    else:
+        aim = np.array([0.0, 0.0, -c.gear_m])
+        descent = descent_rate(height, c)
+    velocity[2] = descent - deck_rate_ahead(e, seen.forecast, c.response_s)
+    inside, quiet = probably_inside(e, c.r_land_m), probably_quiet(e, seen.forecast, c)
+    return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.land_tilt_rad, aim, inside, quiet)
+
+
+def descent_rate(height_m: float, c: LandingConfig) -> float:
+    """Return the rate [m/s] relative to the deck of the last descent: that of the approach, slowing down to that of the
+    touchdown until the target need not be in view any more.
+    """
+    slowing = c.touchdown_rate_mps + c.position_gain * (height_m - c.blind_height_m)
+    return min(c.approach_rate_mps, max(c.touchdown_rate_mps, slowing))
+
+
+def time_to_contact(height_m: float, c: LandingConfig) -> float:
+    """Return how long [s] the last descent takes from a height over the deck."""
+    slow, fast, gain = c.touchdown_rate_mps, c.approach_rate_mps, c.position_gain
+    end = max(c.blind_height_m, c.gear_m)
+    begin = end + (fast - slow) / gain
+    time = max(0.0, min(height_m, end) - c.gear_m) / slow
+    if height_m > end:
+        time += math.log1p(gain * (min(height_m, begin) - end) / slow) / gain
+    return time + max(0.0, height_m - begin) / fast
+
+
+def deck_rate_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) -> float:
+    """Return the deck's rate [m/s], up, as it will be when the vehicle has followed the set-point."""
+    return float(e.deck[7]) if forecast is None else forecast.rate_at(ahead_s)[0]
+
+
+def sway_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) -> Array:
+    """Return the deck's horizontal velocity (2,) [m/s] as it will be when the vehicle has followed the set-point."""
+    now: Array = e.velocity_mps[:2] - e.deck[3:5]
+    return now.copy() if forecast is None else forecast.sway_at(ahead_s)
+
+
+def _towards(offset: Array, limit: float, gain: float) -> Array:
+    """Return the velocity (2,) that closes an offset (2,), of limited length."""
+    wanted = gain * offset
+    length = float(np.hypot(wanted[0], wanted[1]))
+    return wanted if length <= limit else np.asarray(wanted * (limit / length))
+
+
+def _vertical(down_m: float, c: LandingConfig) -> float:
+    """Return the vertical velocity, down, that closes a height error (positive: too high)."""
+    return min(c.climb_mps, max(-c.climb_mps, c.position_gain * down_m))
