@@ -1,7 +1,9 @@
 """A second renderer, independent of ``simulation.renderer``: rays, many for each pixel, in linear light.
 
 It shares nothing with the other but the camera's calibration and the target's radii. Every pixel is the mean of
-``samples`` x ``samples`` rays; then a point spread (Gaussian, disc, or the sensor's own box alone), motion along a
+``samples`` x ``samples`` rays, of more where the target is small: the rays' lattice moves a circle's edge by some
+n^-1.5 r^-0.5 px (n rays to a pixel, radius r), which with 8 rays is 0.002 px at 34 m, half of what noise does
+there, and with 32 a tenth of it. Then a point spread (Gaussian, disc, or the sensor's own box alone), motion along a
 straight path, photon and read noise, a tone curve and eight bits. The sea is a sum of random waves and speckle.
 Slow, and plain; used to see that what the detector claims does not lean on one model of an edge.
 """
@@ -20,6 +22,10 @@ from vision.target import RingTarget
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+
+
+LATTICE, MAX_SAMPLES = 600.0, 32
+"""Rays across a target's diameter, at least, and to a pixel's side, at most."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,9 @@ class Raycast:
 
     def render(self, R_nc: Array, truth: Array, rng: np.random.Generator, look: Look) -> Image:
         """Return the picture (height, width, 3) uint8 BGR of a level target at P^c = ``truth``, attitude R_nc."""
-        w, h, n = self.camera.width, self.camera.height, look.samples
+        w, h = self.camera.width, self.camera.height
+        diameter_px = 2.0 * self.target.edges_m[0] * self.camera.fx / float(np.linalg.norm(truth))
+        n = max(look.samples, min(MAX_SAMPLES, math.ceil(LATTICE / diameter_px)))
         centre = R_nc @ truth
         v, u = np.mgrid[0:h, 0:w].astype(np.float64)
         light = self._colours(R_nc, centre, u, v, sea=True)

@@ -478,21 +478,25 @@ def main() -> int:
     if unknown:
         parser.error(f"--only: no part {unknown[0]!r}; there are {', '.join(parts)}")
     targets = Targets()
-    results = {part: run(targets) for part, run in parts.items() if part in wanted}
+    results: dict[str, Any] = {}
+    record = {"benchmark": "vision", **provenance(), "frames": frames}
+
+    def write() -> None:
+        if arguments.json:
+            whole = {**record, **results, "targets": targets.as_rows()}
+            Path(arguments.json).write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+
+    # A full run takes the better part of an hour: what is done is written, should it be broken off.
+    for part, run in parts.items():
+        if part in wanted:
+            results[part] = run(targets)
+            write()
     if arguments.baseline:
         for part, result in results.items():
             if part in FILES:
                 compare(part, result, targets)
     kept = targets.report()
-    if arguments.json:
-        record = {
-            "benchmark": "vision",
-            **provenance(),
-            "frames": frames,
-            **results,
-            "targets": targets.as_rows(),
-        }
-        Path(arguments.json).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write()
     return 0 if kept else 1
 
 

@@ -180,6 +180,11 @@ def solve_area(
     alone = Place(place.camera_view, place.centre, place.kappa, np.zeros(2), blur, np.inf)
     _, plain, _ = descend(disc, alone_px, alone, step.weight, 6, 0.03)
     gain = plain.mean_square / step.mean_square if plain.ok else 1.0
+    if not plain.ok:
+        # Nothing holds a disc where the white around it has lost its weight.
+        _, plain, _ = descend(disc, alone_px, alone, np.ones(len(used.u)), 6, 0.03)
+        all_alike = (step.residual * step.residual).mean()
+        gain = plain.mean_square / all_alike if plain.ok else 1.0
     return _result(model, place, step, used, gain, clipped)
 
 

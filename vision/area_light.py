@@ -79,11 +79,15 @@ def light_columns(pattern: Array, sectors: int) -> Array:
     return columns
 
 
-def solve_light(pattern: Array, value: Array, sectors: int, limit: float, fixed_weight: Array) -> Light:
+def solve_light(
+    pattern: Array, value: Array, beyond: Array, sectors: int, limit: float, fixed_weight: Array
+) -> Light:
     """Return the light under which the pattern fits the brightness best, with robust weights.
 
     ``limit`` is the residual beyond which a pixel in one of several lights loses its weight, where it is finite;
-    ``fixed_weight`` replaces all weights where it is not empty.
+    ``fixed_weight`` replaces all weights where it is not empty. ``beyond`` (n,) is the share of each pixel's light that
+    may come from outside the white board; what is there differs from white by about the contrast, and that is an error
+    of the pixel beside its noise.
     """
     columns = light_columns(pattern, sectors)
     alone = pattern[:, PATTERN] == pattern[:, OUTERMOST]
@@ -110,6 +114,8 @@ def solve_light(pattern: Array, value: Array, sectors: int, limit: float, fixed_
         else:
             bound = limit if np.isfinite(limit) else 2.5 * scale
             weight = 1.0 / (1.0 + (residual / bound) ** 4)
+        strange = beyond * (np.abs(coefficients[1 if sectors == 1 else sectors]) / scale)
+        weight = weight / (1.0 + strange * strange)
     if sectors == 1:
         contrast = coefficients[1] + columns[:, 3] * coefficients[5] + columns[:, 4] * coefficients[6]
         outer = coefficients[2]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.lines import Edges
-from vision.profile import FAR_PX, edge_profile, pixel_box
+from vision.profile import FAR_PX, edge_profile, phi, pixel_box
 from vision.view import View, either, pixel_rays, plane_gradient, rays_to_plane, to_pixels, units_per_pixel
 
 Array = NDArray[np.float64]
@@ -131,6 +131,19 @@ def offsets(view: View, pixels: Pixels, centre: Array) -> tuple[Array, Array]:
     x, y = pixel_rays(view, pixels.u, pixels.v)
     qx, qy = rays_to_plane(view, x, y, pixels.v)
     return qx - centre[0], qy - centre[1]
+
+
+def share_beyond(view: View, pixels: Pixels, centre: Array, radius: float, blur_px: float) -> Array:
+    """Return which share of a pixel's light may come from outside a circle of the level plane (n,), with a blur of
+    1-sigma ``blur_px``: of a white board, the circle that it holds whichever way it is turned.
+    """
+    ex, ey = offsets(view, pixels, centre)
+    stretch = radius / np.maximum(np.sqrt(ex * ex + ey * ey), 1e-9 * radius)
+    u, v = to_pixels(view, centre[0] + stretch * ex, centre[1] + stretch * ey)
+    away = np.sqrt((u - pixels.u) ** 2 + (v - pixels.v) ** 2)
+    # From half way to the middle nothing is seen of it, and in the middle there is no direction to it.
+    share: Array = either(stretch > 2.0, 0.0, phi(either(stretch < 1.0, away, -away) / blur_px))
+    return share
 
 
 def circle_bounds(view: View, centre: Array, radius: float) -> tuple[float, float, float, float]:

@@ -8,7 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.area_light import brightness_rows, solve_light
-from vision.area_model import BLUR, FILTER, GROWTH, PARAMETERS, Blur, Pixels, offsets, pattern_rows
+from vision.area_model import (
+    BLUR,
+    FILTER,
+    GROWTH,
+    PARAMETERS,
+    Blur,
+    Pixels,
+    offsets,
+    pattern_rows,
+    share_beyond,
+    total_blur_px,
+)
 from vision.area_pixels import chosen
 from vision.lines import Edges
 from vision.plane import rotation_xy
@@ -91,7 +102,13 @@ def linearised(model: AreaModel, pixels: Pixels, place: Place, fixed_weight: Arr
     if len(pixels.u) < MIN_PIXELS:
         return no_equations()
     pattern = pattern_rows(place.camera_view, pixels, place.centre, place.kappa, model.edges, place.blur)
-    light = solve_light(pattern, pixels.value, model.sectors, place.limit, fixed_weight)
+    beyond = np.zeros(len(pixels.u))
+    if pixels.filtered:
+        # On the way there, and where all pixels would be too many, the board is taken as endless: a place with a wrong
+        # scale would have all that contradicts it beyond.
+        board = place.kappa * (model.edges.radius_m[0] + model.margin_m)
+        beyond = share_beyond(place.camera_view, pixels, place.centre, board, total_blur_px(place.blur))
+    light = solve_light(pattern, pixels.value, beyond, model.sectors, place.limit, fixed_weight)
     contrast = light.contrast
     if not (light.ok and contrast > 4.0 and contrast + light.outer > 3.0):
         return no_equations()

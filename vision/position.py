@@ -49,12 +49,9 @@ class Positions:
         blur_error = BLUR_ERROR * max(0.0, fit.blur_px - SHARP_BLUR_PX) * crowding
         growth = math.sqrt(max(0.0, fit.growth_px**2 - fit.growth_sigma_px**2))
         outward = math.hypot(self.model_error_px, blur_error, GROWTH_ERROR * growth)
-        inner = fit.covariance.copy()
-        inner[0, 0] += (self.model_error_px * unit) ** 2
-        inner[1, 1] += (self.model_error_px * unit) ** 2
         sigmas = (self.focal_sigma, self.principal_point_sigma_px, self.principal_point_sigma_px, outward)
         shifts = fit.considered * sigmas
-        covariance = jacobian @ (inner + shifts @ shifts.T) @ jacobian.T
+        covariance = jacobian @ (fit.covariance + shifts @ shifts.T) @ jacobian.T
         if known_attitude and self.attitude_sigma_rad > 0.0:
             turn = skew(position)
             covariance += self.attitude_sigma_rad**2 * (turn @ turn.T)

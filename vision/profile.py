@@ -42,6 +42,8 @@ SQRT_2_OVER_PI = 0.7978845608028654
 INV_SQRT_2PI = 0.3989422804014327
 MIN_CONTRAST = 4.0
 """Least brightness across an edge."""
+MIN_EDGES = 10
+"""Least number of lines that show an edge."""
 MIN_VARIANCE = 0.08
 """Variance of the rounding to whole numbers, the least noise of a pixel."""
 CLIPPED_ERROR_PX = 0.3
@@ -278,16 +280,21 @@ def displacements(
 
 
 def measure(lines: Lines, gram: Array, free_blur: bool) -> Measured:
-    """Solve each line for its contrast and displacement, and for its blur where ``free_blur``."""
+    """Solve each line for its contrast and displacement, and for its blur where ``free_blur``.
+
+    Lines without contrast say nothing about that of the target: where something lies across its middle, they are
+    the greater part.
+    """
     contrast, shift, wider, inverse, rest = solve_lines(gram, free_blur)
-    middle = median(contrast)
+    seen = contrast > MIN_CONTRAST
+    middle = median(contrast[seen]) if np.count_nonzero(seen) >= MIN_EDGES else 0.0
     noise = max(median(line_noise(rest, lines.row[:, TOTAL])), MIN_VARIANCE)
     delta, sigma2, valid = displacements(lines, gram, contrast, shift, inverse, rest, middle, noise)
     clipped = lines.row[:, CLIPPED]
     if ((1.0 - clipped) * valid).sum() >= ENOUGH_UNCLIPPED:
         # Glare moves single edges; where nearly all are clipped they grow alike.
         sigma2 = sigma2 + CLIPPED_ERROR_PX**2 * clipped
-    ok = middle > MIN_CONTRAST and bool(np.count_nonzero(valid) >= 10)
+    ok = middle > MIN_CONTRAST and bool(np.count_nonzero(valid) >= MIN_EDGES)
     return Measured(ok, delta, sigma2, valid, wider / np.maximum(contrast, 1.0), middle)
 
 

@@ -41,7 +41,7 @@ from vision.lines import (
 )
 from vision.plane import LevelPlane, rotation_xy
 from vision.profile import crowded, line_blurs, line_boxes, line_moments, measure, updated_blur
-from vision.robust import Solved, least_squares, median, normal_equations, times
+from vision.robust import Solved, least_squares, median, normal_equations, scatter_covariance, times
 from vision.view import View, turned
 
 Array = NDArray[np.float64]
@@ -225,6 +225,7 @@ class _Step(NamedTuple):
     contrast: float
     blur_px: float
     blur_xy: Array
+    precision: Array
 
 
 def _fit_lines(
@@ -270,7 +271,7 @@ def _fit_lines(
     moved = total - base
     moved[n - 1] = 0.0
     moved_px = float(np.abs(times(a, moved)).max())
-    return _Step(ok, solved, change, moved_px, measured.contrast, blur_px, blur_xy)
+    return _Step(ok, solved, change, moved_px, measured.contrast, blur_px, blur_xy, precision)
 
 
 def _result(
@@ -294,10 +295,10 @@ def _result(
         shift = times(solved.inverse, pulled)
         for i in range(n - 1):
             considered[free[i], k] = -shift[i]
-    # Scatter of the displacements about the model scales the covariance, up and down.
+    spread = scatter_covariance(a, solved, step.precision)
     for i in range(n - 1):
         for j in range(n - 1):
-            covariance[free[i], free[j]] = solved.inverse[i, j] * solved.chi2
+            covariance[free[i], free[j]] = spread[i, j]
     inlier = solved.inlier
     laid, agreeing = counted(lines.edge, inlier, len(edges.radius_m))
     share, contradicted, slope = agreement(lines, edges, laid, inlier, step.contrast)
@@ -314,7 +315,7 @@ def _result(
         agreeing > 0.4 * laid,
         blur_px,
         growth_px,
-        np.sqrt(solved.inverse[n - 1, n - 1] * solved.chi2),
+        np.sqrt(spread[n - 1, n - 1]),
         solved.chi2,
         int(np.count_nonzero(inlier)),
         int(np.count_nonzero(laid)),

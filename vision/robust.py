@@ -91,6 +91,31 @@ def least_squares(
     return Solved(ok and bool(used >= 10), inverse, weight, residual, inlier, change, chi2)
 
 
+def scatter_covariance(a: Array, solved: Solved, precision: Array) -> Array:
+    """Return the covariance (n, n) of the parameters from the scatter of the residuals.
+
+    With H the inverse of the normal matrix, W the weights, P the prior's ``precision`` and s^2 the rows' variance as
+    the residuals show it,
+
+        H (s^2 A' W^2 A + P) H
+
+    (Huber's sandwich). Weights come from variances that each row estimates from a few pixels of its own, and from
+    the residuals, so that they differ by chance: H alone, which is right where weights are the inverse of variances,
+    then claims too little by the mean square of the weights over their squared mean, some 10 %. Where they differ
+    with reason, this claims too much by no more than that.
+    """
+    used = np.count_nonzero(solved.weight)
+    variance = solved.chi2 * used / max(solved.weight.sum(), 1e-12)
+    meat, _ = normal_equations(a, solved.weight * solved.weight, solved.residual)
+    meat = variance * meat
+    for k in range(len(precision)):
+        meat[k, k] += precision[k]
+    covariance = np.empty((len(precision), len(precision)))
+    for k in range(len(precision)):
+        covariance[k] = times(solved.inverse, times(meat, solved.inverse[k]))
+    return covariance
+
+
 def reweighted(
     a: Array, delta: Array, full: Array, change: Array, valid: NDArray[np.bool_]
 ) -> tuple[Array, Array, float, float]:

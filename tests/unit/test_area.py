@@ -9,7 +9,17 @@ from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_to_matrix
 from simulation.renderer import Conditions, Renderer
 from vision import Camera, RingTarget, TargetDetector
 from vision.area_covariance import sandwich
-from vision.area_model import ALL, FIRST, OUTERMOST, PATTERN, Blur, Pixels, pattern_rows
+from vision.area_model import (
+    ALL,
+    FIRST,
+    OUTERMOST,
+    PATTERN,
+    Blur,
+    Pixels,
+    offsets,
+    pattern_rows,
+    share_beyond,
+)
 from vision.area_pixels import chosen, take_pixels, thinned
 from vision.lines import edges_of
 from vision.plane import LevelPlane, rotation_xy
@@ -100,6 +110,24 @@ def test_considered_columns_are_those_of_the_camera():
         difference = (plus - minus) / (2.0 * step)
         column = rows[:, ALL + 8 + k]
         assert np.linalg.norm(column - difference) < 0.03 * np.linalg.norm(difference), k
+
+
+def test_light_from_beyond_the_board_is_told_by_the_distance_to_it():
+    """Half of it on the border, 2.3 % two blurs within, in pixels whatever the slant; none in the middle."""
+    plane = plane_of()
+    centre, kappa = place(plane, 20.0)
+    pixels, _ = take_pixels(IMAGE, plane.view, centre, 0.5 * kappa, 4.0)
+    radius = 0.5 * kappa
+    share = share_beyond(plane.view, pixels, centre, radius, 0.6)
+    ex, ey = offsets(plane.view, pixels, centre)
+    rho = np.hypot(ex, ey)
+    u, v = plane.to_pixels(centre[0] + radius * ex / rho, centre[1] + radius * ey / rho)
+    away = np.hypot(u - pixels.u, v - pixels.v) * np.sign(radius - rho)
+    on, within = np.abs(away) < 0.1, np.abs(away - 1.2) < 0.1
+    assert on.any() and within.any()
+    assert np.abs(share[on] - 0.5).max() < 0.08
+    assert np.abs(share[within] - 0.023).max() < 0.012
+    assert share[rho < 0.3 * radius].max() < 1e-4
 
 
 def test_thinning_keeps_pixels_evenly():

@@ -137,6 +137,15 @@ def test_bears_bad_light_and_things_in_the_way(conditions):
     assert np.linalg.norm(fix.position_cam_m - truth) < 2e-3 * np.linalg.norm(truth)
 
 
+def test_a_bar_across_the_middle_hides_the_inner_edges_only():
+    """Most lines then show no edge, and the contrast is that of the others."""
+    bar = Conditions(read_noise=3.0, bar_px=45.0, bar_offset=0.02, bar_angle_rad=0.9)
+    image, R_nc, truth = scene(RECOMMENDED, 2.0, 8.0, -12.0, 30.0, (340.0, 180.0), bar)
+    fix = detector_of(CAMERA, RECOMMENDED).detect(image, R_nc)
+    assert isinstance(fix, VisionFix)
+    assert np.linalg.norm(fix.position_cam_m - truth) < 2e-3 * np.linalg.norm(truth)
+
+
 def test_finds_a_target_partly_out_of_the_frame():
     image, R_nc, truth = scene(THESIS, 5.0, 10.0, -5.0, 15.0, (12.0, 250.0))
     fix = detector_of(CAMERA, THESIS).detect(image, R_nc)

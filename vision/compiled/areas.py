@@ -36,7 +36,7 @@ from vision.area_model import (
     sharp_rows,
 )
 from vision.lines import Edges
-from vision.profile import FAR_PX, edge_profile
+from vision.profile import FAR_PX, edge_profile, phi
 from vision.view import View, pixel_rays, plane_gradient, rays_to_plane, to_pixels, units_per_pixel
 
 Array = NDArray[np.float64]
@@ -63,6 +63,25 @@ def _offsets(view: View, pixels: Pixels, centre: Array) -> Callable[..., tuple[A
         return ex, ey
 
     return offsets
+
+
+@overload(area_model.share_beyond)
+def _share_beyond(
+    view: View, pixels: Pixels, centre: Array, radius: float, blur_px: float
+) -> Callable[..., Array]:
+    def share(view: View, pixels: Pixels, centre: Array, radius: float, blur_px: float) -> Array:
+        ex, ey = area_model.offsets(view, pixels, centre)
+        out = np.zeros(len(ex))
+        for i in range(len(ex)):
+            stretch = radius / max(math.sqrt(ex[i] * ex[i] + ey[i] * ey[i]), 1e-9 * radius)
+            if stretch > 2.0:
+                continue
+            u, v = to_pixels(view, centre[0] + stretch * ex[i], centre[1] + stretch * ey[i])
+            away = math.sqrt((u - pixels.u[i]) ** 2 + (v - pixels.v[i]) ** 2)
+            out[i] = phi((away if stretch < 1.0 else -away) / blur_px)
+        return out
+
+    return share
 
 
 @overload(area_model.circle_bounds)
@@ -316,6 +335,7 @@ def _block_sums(turned: Array, score: Array, pixels: Pixels) -> Callable[..., Ar
 REPLACED = (
     area_covariance.block_sums,
     area_model.offsets,
+    area_model.share_beyond,
     area_model.circle_bounds,
     area_model.pattern_rows,
     area_model.sharp_rows,
