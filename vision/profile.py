@@ -33,7 +33,7 @@ from vision.lines import (
     WEIGHT,
     Lines,
 )
-from vision.robust import inverted, masked, median, normal_equations, times
+from vision.robust import MODEL_VARIANCE_PX2, inverted, masked, median, normal_equations, times
 from vision.view import either
 
 Array = NDArray[np.float64]
@@ -61,7 +61,8 @@ DIRECTIONAL_PX = 0.85
 
 class Measured(NamedTuple):
     """What lines say, all (p,): displacement [px], its variance, whether it is an edge at all, and the change
-    of the logarithm of its blur; the edges' median ``contrast``. Not ``ok`` where there are too few.
+    of the logarithm of its blur; the variance ``expected`` where all pixels are as noisy as the median line's; the
+    edges' median ``contrast``. Not ``ok`` where there are too few.
     """
 
     ok: bool
@@ -69,6 +70,7 @@ class Measured(NamedTuple):
     sigma2: Array
     valid: NDArray[np.bool_]
     ratio: Array
+    expected: Array
     contrast: float
 
 
@@ -290,12 +292,15 @@ def measure(lines: Lines, gram: Array, free_blur: bool) -> Measured:
     middle = median(contrast[seen]) if np.count_nonzero(seen) >= MIN_EDGES else 0.0
     noise = max(median(line_noise(rest, lines.row[:, TOTAL])), MIN_VARIANCE)
     delta, sigma2, valid = displacements(lines, gram, contrast, shift, inverse, rest, middle, noise)
+    seen_contrast = np.maximum(contrast, 1.0)
+    expected = noise * inverse / (seen_contrast * seen_contrast) + MODEL_VARIANCE_PX2
     clipped = lines.row[:, CLIPPED]
     if ((1.0 - clipped) * valid).sum() >= ENOUGH_UNCLIPPED:
         # Glare moves single edges; where nearly all are clipped they grow alike.
         sigma2 = sigma2 + CLIPPED_ERROR_PX**2 * clipped
+        expected = expected + CLIPPED_ERROR_PX**2 * clipped
     ok = middle > MIN_CONTRAST and bool(np.count_nonzero(valid) >= MIN_EDGES)
-    return Measured(ok, delta, sigma2, valid, wider / np.maximum(contrast, 1.0), middle)
+    return Measured(ok, delta, sigma2, valid, wider / seen_contrast, expected, middle)
 
 
 def updated_blur(

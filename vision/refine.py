@@ -226,6 +226,7 @@ class _Step(NamedTuple):
     blur_px: float
     blur_xy: Array
     precision: Array
+    expected: Array
 
 
 def _fit_lines(
@@ -271,7 +272,9 @@ def _fit_lines(
     moved = total - base
     moved[n - 1] = 0.0
     moved_px = float(np.abs(times(a, moved)).max())
-    return _Step(ok, solved, change, moved_px, measured.contrast, blur_px, blur_xy, precision)
+    return _Step(
+        ok, solved, change, moved_px, measured.contrast, blur_px, blur_xy, precision, measured.expected
+    )
 
 
 def _result(
@@ -295,7 +298,7 @@ def _result(
         shift = times(solved.inverse, pulled)
         for i in range(n - 1):
             considered[free[i], k] = -shift[i]
-    spread = scatter_covariance(a, solved, step.precision)
+    spread = scatter_covariance(a, solved, step.precision, step.expected)
     for i in range(n - 1):
         for j in range(n - 1):
             covariance[free[i], free[j]] = spread[i, j]

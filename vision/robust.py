@@ -91,23 +91,22 @@ def least_squares(
     return Solved(ok and bool(used >= 10), inverse, weight, residual, inlier, change, chi2)
 
 
-def scatter_covariance(a: Array, solved: Solved, precision: Array) -> Array:
+def scatter_covariance(a: Array, solved: Solved, precision: Array, expected: Array) -> Array:
     """Return the covariance (n, n) of the parameters from the scatter of the residuals.
 
-    With H the inverse of the normal matrix, W the weights, P the prior's ``precision`` and s^2 the rows' variance as
-    the residuals show it,
+    With H the inverse of the normal matrix, W the weights, P the prior's ``precision``, V the rows' ``expected``
+    variances (p,) and s^2 what the residuals show these have to be multiplied by,
 
-        H (s^2 A' W^2 A + P) H
+        H (s^2 A' W V W A + P) H
 
     (Huber's sandwich). Weights come from variances that each row estimates from a few pixels of its own, and from
-    the residuals, so that they differ by chance: H alone, which is right where weights are the inverse of variances,
-    then claims too little by the mean square of the weights over their squared mean, some 10 %. Where they differ
-    with reason, this claims too much by no more than that.
+    the residuals, so that they differ by chance beside what is expected: H alone, which is right where weights are the
+    inverse of variances, then claims some 10 % too little.
     """
-    used = np.count_nonzero(solved.weight)
-    variance = solved.chi2 * used / max(solved.weight.sum(), 1e-12)
-    meat, _ = normal_equations(a, solved.weight * solved.weight, solved.residual)
-    meat = variance * meat
+    variance = masked(expected, solved.weight > 0.0)
+    scale = solved.chi2 * np.count_nonzero(solved.weight) / max((solved.weight * variance).sum(), 1e-12)
+    meat, _ = normal_equations(a, solved.weight * solved.weight * variance, solved.residual)
+    meat = scale * meat
     for k in range(len(precision)):
         meat[k, k] += precision[k]
     covariance = np.empty((len(precision), len(precision)))

@@ -18,7 +18,7 @@ def test_covariance_is_the_scatter_where_weights_differ_by_chance():
         delta = 0.2 * rng.standard_normal(60) + a[:, 2] * start
         solved = least_squares(a, delta, own, valid, precision, np.zeros(3))
         estimates.append(solved.change - np.array([0.0, 0.0, start]))
-        claimed += scatter_covariance(a, solved, precision) / 1500.0
+        claimed += scatter_covariance(a, solved, precision, np.full(60, 0.04)) / 1500.0
         plain += solved.inverse * solved.chi2 / 1500.0
     scatter = np.diag(np.cov(np.array(estimates).T))
     ratio = np.diag(claimed) / scatter
