@@ -10,7 +10,7 @@ from numba.extending import overload, register_jitable
 from numpy.typing import NDArray
 
 from vision import area_covariance, area_light, area_model
-from vision.area_covariance import BLOCK
+from vision.area_covariance import BLOCK, window
 from vision.area_light import Light, sector_of
 from vision.area_model import (
     ALL,
@@ -310,6 +310,32 @@ def _brightness_rows(pattern: Array, light: Light, free: Int) -> Callable[..., t
     return moved
 
 
+@overload(area_covariance.freedom)
+def _freedom(turned: Array, weight: Array, pixels: Pixels) -> Callable[..., Array]:
+    def degrees(turned: Array, weight: Array, pixels: Pixels) -> Array:
+        n, wide = len(weight), pixels.across + 2 * BLOCK - 2
+        box = np.zeros((wide * (pixels.down + 2 * BLOCK - 2), 3))
+        at = np.empty(n, dtype=np.int64)
+        for p in range(n):
+            j, i = int(pixels.u[p] - pixels.corner[0]), int(pixels.v[p] - pixels.corner[1])
+            at[p] = (i + BLOCK - 1) * wide + j + BLOCK - 1
+            for c in range(3):
+                box[at[p], c] = (turned[p, c] * weight[p]) ** 2
+        total, together = np.zeros(3), np.zeros(3)
+        for c in range(3):
+            for p in range(n):
+                total[c] += box[at[p], c]
+        for di in range(1 - BLOCK, BLOCK):
+            for dj in range(1 - BLOCK, BLOCK):
+                square = window(di, dj) ** 2
+                for p in range(n):
+                    for c in range(3):
+                        together[c] += square * box[at[p], c] * box[at[p] + di * wide + dj, c]
+        return total**2 / np.maximum(together, 1e-300)
+
+    return degrees
+
+
 @overload(area_covariance.block_sums)
 def _block_sums(turned: Array, score: Array, pixels: Pixels) -> Callable[..., Array]:
     def sums(turned: Array, score: Array, pixels: Pixels) -> Array:
@@ -333,6 +359,7 @@ def _block_sums(turned: Array, score: Array, pixels: Pixels) -> Callable[..., Ar
 
 
 REPLACED = (
+    area_covariance.freedom,
     area_covariance.block_sums,
     area_model.offsets,
     area_model.share_beyond,
