@@ -15,14 +15,27 @@ from pathlib import Path
 import numpy as np
 from numba.extending import overload, register_jitable
 
-from estimation import deck, frames, models, parameters, state, update, watch
+from estimation import algebra, deck, frames, models, parameters, state, update, watch
+from estimation import relinearise as relinearisation
 from estimation import rows as rows_module
 from estimation import trail as trail_module
+from estimation.algebra import (
+    congruence,
+    corrected,
+    cross_covariance,
+    determinant,
+    gain,
+    innovation_covariance,
+    inverse,
+    joseph,
+    reset_attitude,
+)
 from estimation.codecache import jitted
 from estimation.deck import HEAVE_PARAMETERS, MOTION_SIZE, add_drift, change_motion, deck_output, seen_place
 from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
 from estimation.outcome import Outcome
+from estimation.relinearise import moved_far, relinearise
 from estimation.rows import (
     HEAVE_MODEL,
     KIND,
@@ -102,7 +115,7 @@ def _put(target: Array, row: int, column: int, scale: float, block: Array) -> Ca
     return assign
 
 
-for _module in (deck, frames, models, state, update, watch):
+for _module in (algebra, deck, frames, models, relinearisation, state, update, watch):
     for _function in vars(_module).values():
         if (
             inspect.isfunction(_function)
@@ -199,7 +212,6 @@ def _fuse(
     x: Array, P: Array, memory: Array, scatter: Array, kind: int, value: Array, own: Array, gyro: Array,
     t_s: float, late: int, p: Array, offsets: Offsets, heave: Array, H: Array, result: Array,
 ) -> tuple[int, int, Array]:  # fmt: skip
-    n = P.shape[0]
     r = np.zeros(3)
     R = np.zeros((3, 3))
     result[:] = 0.0
@@ -208,24 +220,20 @@ def _fuse(
         return -m, 0, x
     if kind == BAROMETER:
         R[0, 0] = reading_noise(memory, t_s, r[0], R[0, 0])
-    PHt = np.zeros((n, 3))
-    for i in range(n):
-        for j in range(m):
-            for k in range(n):
-                PHt[i, j] += P[i, k] * H[j, k]
-    S = _innovation_covariance(H, PHt, R, 1.0, m)
-    inverse = _inverse(S, m)
+    PHt = cross_covariance(P, H, m)
+    S = innovation_covariance(H, PHt, R, 1.0, m)
+    inverted = inverse(S, m)
     nis = 0.0
     for i in range(m):
         for j in range(m):
-            nis += r[i] * inverse[i, j] * r[j]
+            nis += r[i] * inverted[i, j] * r[j]
         result[2 + i] = r[i]
         result[5 + i] = math.sqrt(S[i, i])
     result[0] = nis
     result[1] = m
     if kind == VISION:
         seen_place(r, R, x, p, result[8:14])
-    result[15] = math.log(_determinant(S, m))
+    result[15] = math.log(determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     mark = 0
@@ -240,21 +248,21 @@ def _fuse(
     memory[0] = 0.0
     if w < 1.0:
         outcome = _DOWNWEIGHTED
-        inverse = _inverse(_innovation_covariance(H, PHt, R, 1.0 / w, m), m)
-    K = np.zeros((n, 3))
-    error = np.zeros(n)
-    for i in range(n):
-        for j in range(m):
-            for k in range(m):
-                K[i, j] += PHt[i, k] * inverse[k, j]
-            error[i] += K[i, j] * r[j]
+        inverted = inverse(innovation_covariance(H, PHt, R, 1.0 / w, m), m)
+    K = gain(PHt, inverted, m)
+    error = corrected(K, r, m)
     first, stop = considered(kind, scatter, p, offsets)
     held = P[first:stop, first:stop].copy()
-    for i in range(first, stop):
-        error[i] = 0.0
-    _joseph(P, K, H, R, 1.0 / w, m)
+    error[first:stop] = 0.0
+    if moved_far(kind, error, offsets):
+        relinearise(value, own, x, error, gyro, p, offsets, r, H, R)
+        PHt = cross_covariance(P, H, m)
+        K = gain(PHt, inverse(innovation_covariance(H, PHt, R, 1.0 / w, m), m), m)
+        error = corrected(K, r, m)
+        error[first:stop] = 0.0
+    joseph(P, K, H, R, 1.0 / w, m)
     att = offsets[ATTITUDE]
-    _reset_attitude(P, right_jacobian(error[att : att + 3]), att)
+    reset_attitude(P, right_jacobian(error[att : att + 3]), att)
     x = plus(x, error, offsets)
     result[14] = x[PL0]
     if stop > 0:
@@ -263,118 +271,6 @@ def _fuse(
                 P[i, j] = held[i - first, j - first]
         hold_latency(x, p)
     return outcome, mark, x
-
-
-def _innovation_covariance(H: Array, PHt: Array, R: Array, scale: float, m: int) -> Array:
-    """Return H P H' + scale R, (3, 3) of which m rows are used."""
-    S = np.zeros((3, 3))
-    for i in range(m):
-        for j in range(m):
-            S[i, j] = scale * R[i, j]
-            for k in range(PHt.shape[0]):
-                S[i, j] += H[i, k] * PHt[k, j]
-    return S
-
-
-def _determinant(S: Array, m: int) -> float:
-    """Return the determinant of the leading (m, m) part."""
-    if m == 1:
-        return float(S[0, 0])
-    minor = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
-    if m == 2:
-        return float(minor)
-    return float(
-        S[2, 2] * minor
-        - S[2, 1] * (S[0, 0] * S[1, 2] - S[0, 2] * S[1, 0])
-        + S[2, 0] * (S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1])
-    )
-
-
-def _inverse(S: Array, m: int) -> Array:
-    """Return the inverse of the leading (m, m) part of a positive definite matrix, by Gauss-Jordan."""
-    A = S.copy()
-    B = np.eye(3)
-    for c in range(m):
-        scale = 1.0 / A[c, c]
-        for j in range(m):
-            A[c, j] *= scale
-            B[c, j] *= scale
-        for i in range(m):
-            if i != c:
-                f = A[i, c]
-                for j in range(m):
-                    A[i, j] -= f * A[c, j]
-                    B[i, j] -= f * B[c, j]
-    return B
-
-
-def _joseph(P: Array, K: Array, H: Array, R: Array, scale: float, m: int) -> None:
-    """Replace P by (I - KH) P (I - KH)' + K scale R K', and symmetrise it."""
-    n = P.shape[0]
-    B = P.copy()
-    for j in range(m):
-        HP = np.zeros(n)
-        for k in range(n):
-            h = H[j, k]
-            if h != 0.0:
-                for c in range(n):
-                    HP[c] += h * P[k, c]
-        for i in range(n):
-            for c in range(n):
-                B[i, c] -= K[i, j] * HP[c]
-    # Columns: B (I - KH)' = B - (B H') K'; then the noise.
-    C = np.zeros((n, 3))
-    for i in range(n):
-        for j in range(m):
-            for k in range(n):
-                C[i, j] -= B[i, k] * H[j, k]
-            for k in range(m):
-                C[i, j] += scale * K[i, k] * R[k, j]
-    for i in range(n):
-        for c in range(n):
-            for j in range(m):
-                B[i, c] += C[i, j] * K[c, j]
-    for i in range(n):
-        for c in range(n):
-            P[i, c] = 0.5 * (B[i, c] + B[c, i])
-
-
-def _reset_attitude(P: Array, G: Array, att: int) -> None:
-    """Carry the attitude's covariance over to the new nominal attitude: G P G', G (3, 3) on its three entries."""
-    n = P.shape[0]
-    old = np.empty(3)
-    for c in range(n):
-        for i in range(3):
-            old[i] = P[att + i, c]
-        for i in range(3):
-            P[att + i, c] = G[i, 0] * old[0] + G[i, 1] * old[1] + G[i, 2] * old[2]
-    for c in range(n):
-        for i in range(3):
-            old[i] = P[c, att + i]
-        for i in range(3):
-            P[c, att + i] = G[i, 0] * old[0] + G[i, 1] * old[1] + G[i, 2] * old[2]
-    for i in range(n):
-        for c in range(i):
-            mean = 0.5 * (P[i, c] + P[c, i])
-            P[i, c] = mean
-            P[c, i] = mean
-
-
-def _congruence(A: Array, P: Array, out: Array) -> None:
-    """Write A P A' (m, m) for A (m, n) with few entries."""
-    m, n = A.shape
-    AP = np.zeros((m, n))
-    for i in range(m):
-        for k in range(n):
-            if A[i, k] != 0.0:
-                for j in range(n):
-                    AP[i, j] += A[i, k] * P[k, j]
-    for i in range(m):
-        for j in range(m):
-            value = 0.0
-            for k in range(n):
-                value += AP[i, k] * A[j, k]
-            out[i, j] = value
 
 
 def _open(
@@ -393,8 +289,7 @@ def _open(
     trail_count[0] = k + 1
 
 
-for _helper in (_congruence, _determinant, _innovation_covariance, _inverse, _joseph, _open, _reset_attitude):
-    register_jitable(_helper)
+register_jitable(_open)
 register_jitable(_transited)
 register_jitable(_propagate_covariance)
 register_jitable(_propagate)
@@ -478,7 +373,7 @@ def _advance(
             if out_deck.shape[1] > 0:
                 y, A = deck_output(state, heave, offsets, n)
                 out_deck[count] = y
-                _congruence(A, P, out_deck_covariance[count])
+                congruence(A, P, out_deck_covariance[count])
                 add_drift(heave, out_deck_covariance[count])
             count += 1
             if recording:
@@ -491,7 +386,19 @@ def _advance(
     return count
 
 
-_SOURCES = (deck, frames, models, parameters, rows_module, state, trail_module, update, watch)
+_SOURCES = (
+    algebra,
+    deck,
+    frames,
+    models,
+    parameters,
+    relinearisation,
+    rows_module,
+    state,
+    trail_module,
+    update,
+    watch,
+)
 _kernel = jitted(_advance, [Path(inspect.getfile(m)) for m in _SOURCES] + [Path(__file__)])
 
 

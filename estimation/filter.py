@@ -18,6 +18,7 @@ from estimation import models, update
 from estimation.deck import add_drift, change_motion, deck_output, seen_place
 from estimation.frames import Array
 from estimation.outcome import Outcome
+from estimation.relinearise import moved_far, relinearise
 from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
 from estimation.state import ATTITUDE, PL0, Layout, plus
 from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
@@ -184,14 +185,14 @@ class FilterPyEngine:
         rows.outcome[i] = Outcome.FUSED_LATE if rows.late[i] else Outcome.FUSED
         if w < 1.0:
             rows.outcome[i] = Outcome.DOWNWEIGHTED
-        ekf = self.ekf
-        ekf.x = np.zeros(n)
-        ekf.P = s.P
-        ekf.update(r, lambda _: H, lambda _: np.zeros(m), R=R / w)
-        error = ekf.x
         first, stop = update.considered(kind, s.scatter, self.p, self.layout.offsets)
         held = s.P[first:stop, first:stop].copy()
+        ekf, error = self.ekf, self._update(r, H, R / w)
         error[first:stop] = 0.0
+        if moved_far(kind, error, self.layout.offsets):
+            relinearise(rows.value[i], rows.own[i], s.x, error, gyro, self.p, self.layout.offsets, r, H, R)
+            error = self._update(r, H, R / w)
+            error[first:stop] = 0.0
         s.x = plus(s.x, error, self.layout.offsets)
         rows.seen[i, 6] = s.x[PL0]
         P = ekf.P
@@ -203,6 +204,14 @@ class FilterPyEngine:
         if stop:
             update.hold_latency(s.x, self.p)
         s.P = 0.5 * (P + P.T)
+
+    def _update(self, r: Array, H: Array, R: Array) -> Array:
+        """Let filterpy update the state's covariance; return the error state (n,)."""
+        ekf, m = self.ekf, len(r)
+        ekf.x = np.zeros(self.layout.size)
+        ekf.P = self.state.P
+        ekf.update(r, lambda _: H, lambda _: np.zeros(m), R=R)
+        return np.asarray(ekf.x)
 
     def _let_go(self, rows: Rows, i: int) -> None:
         s = self.state
