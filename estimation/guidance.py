@@ -89,9 +89,14 @@ def unfit(seen: Situation, c: LandingConfig) -> Reason | None:
     return None
 
 
-def probably_inside(e: Estimate, radius: float) -> float:
-    """Return the probability of being within a radius [m] of the target, horizontally."""
-    return inside_probability(e.deck[:2], e.deck_covariance[:2, :2], radius)
+def probably_inside(e: Estimate, radius: float, ahead_s: float = 0.0) -> float:
+    """Return the probability of being within a radius [m] of the target, horizontally, now or ``ahead_s`` from now,
+    when the relative velocity has carried the vehicle there.
+    """
+    P = e.deck_covariance
+    cross = ahead_s * P[:2, 3:5]
+    covariance = P[:2, :2] + cross + cross.T + ahead_s**2 * P[3:5, 3:5]
+    return inside_probability(e.deck[:2] + ahead_s * e.deck[3:5], covariance, radius)
 
 
 def tilt_rad(e: Estimate) -> float:

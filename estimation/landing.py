@@ -150,11 +150,13 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
         return _abort(p, Reason.TARGET_LOST, seen)
     if tilt_rad(e) > c.abort_tilt_rad:
         return _abort(p, Reason.TILTED, seen)
-    inside = probably_inside(e, c.r_land_m)
     fall_s = time_to_contact(c.hold_height_m, c)
     if p.descent_ns is not None:
-        # So near that the vehicle could not answer before it stands, it is not led up again for its place.
-        committed = height - c.gear_m < c.touchdown_rate_mps * c.response_s
+        # So near that the vehicle could not answer before it stands, it is not led up again for its place. What is
+        # judged until then is the place at contact, as far ahead as an answer takes.
+        reach = c.touchdown_rate_mps * c.response_s
+        committed = abs(height - c.gear_m) < reach
+        inside = probably_inside(e, c.r_land_m, min(time_to_contact(height, c), c.response_s))
         if inside < c.abort_probability and not committed:
             if height <= c.blind_height_m:
                 return _abort(p, Reason.OUTSIDE_R_LAND, seen)
@@ -165,7 +167,7 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
     low = height < c.hold_height_m + HOLD_TOLERANCE_M
     p = _holding(p, low, seen)
     waited = _held_s(p, seen)
-    if low and inside >= c.land_probability and tilt_rad(e) < c.track_tilt_rad:
+    if low and probably_inside(e, c.r_land_m) >= c.land_probability and tilt_rad(e) < c.track_tilt_rad:
         asked = c.quiet_probability * max(0.0, 1.0 - waited / c.wait_s)
         if waited >= c.wait_s:
             return replace(p, descent_ns=seen.now_ns, reason=Reason.WAITED_LONG_ENOUGH)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from estimation.ahead import DeckForecast
 from estimation.config import LandingConfig
 from estimation.frames import euler_to_quat
-from estimation.guidance import deck_rate_ahead, inside_probability, search_altitude_m
+from estimation.guidance import deck_rate_ahead, inside_probability, search_altitude_m, time_to_contact
 from estimation.landing import step
 from estimation.modes import EXPLANATIONS, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
@@ -99,11 +99,14 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
             if before.mode is Mode.LANDING:
                 assert seen.detection_age_s <= C.lost_s or height <= C.blind_height_m
             if after.descent_ns is not None:
-                inside = inside_probability(e.deck[:2], e.deck_covariance[:2, :2], C.r_land_m)
-                fresh = before.descent_ns is None
-                # Nearer than it could answer it is not led up again.
-                committed = height - C.gear_m < C.touchdown_rate_mps * C.response_s and not fresh
-                assert committed or inside >= (C.land_probability if fresh else C.abort_probability)
+                P, fresh = e.deck_covariance, before.descent_ns is None
+                # In the descent it is the place at contact that counts, as far ahead as the vehicle takes to answer.
+                ahead = 0.0 if fresh else min(time_to_contact(height, C), C.response_s)
+                T = np.hstack([np.eye(2), np.zeros((2, 1)), ahead * np.eye(2), np.zeros((2, 3))])
+                inside = inside_probability(T @ e.deck, T @ P @ T.T, C.r_land_m)
+                # Where contact is nearer than it could answer it is not led up again.
+                committed = abs(height - C.gear_m) < C.touchdown_rate_mps * C.response_s and not fresh
+                assert committed or inside >= (C.land_probability if fresh else C.abort_probability) - 1e-9
         if after.mode is not before.mode:
             assert after.since_ns == seen.now_ns
         before = after
