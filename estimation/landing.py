@@ -154,8 +154,7 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
     if p.descent_ns is not None:
         # So near that the vehicle could not answer before it stands, it is not led up again for its place. What is
         # judged until then is the place at contact, as far ahead as an answer takes.
-        reach = c.touchdown_rate_mps * c.response_s
-        committed = abs(height - c.gear_m) < reach
+        committed = height - c.gear_m < c.touchdown_rate_mps * c.response_s
         inside = probably_inside(e, c.r_land_m, min(time_to_contact(height, c), c.response_s))
         if inside < c.abort_probability and not committed:
             if height <= c.blind_height_m:

@@ -104,8 +104,8 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
                 ahead = 0.0 if fresh else min(time_to_contact(height, C), C.response_s)
                 T = np.hstack([np.eye(2), np.zeros((2, 1)), ahead * np.eye(2), np.zeros((2, 3))])
                 inside = inside_probability(T @ e.deck, T @ P @ T.T, C.r_land_m)
-                # Where contact is nearer than it could answer it is not led up again.
-                committed = abs(height - C.gear_m) < C.touchdown_rate_mps * C.response_s and not fresh
+                # Nearer than it could answer it is not led up again.
+                committed = height - C.gear_m < C.touchdown_rate_mps * C.response_s and not fresh
                 assert committed or inside >= (C.land_probability if fresh else C.abort_probability) - 1e-9
         if after.mode is not before.mode:
             assert after.since_ns == seen.now_ns
