@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from estimation.deck import HEAVE_SIZE, heave_matrix, heave_stationary
+from estimation.band import BAND_PARAMETERS, BAND_SIZE, band_matrix, band_stationary
+from estimation.deck import HEAVE, SWAY_EAST, SWAY_NORTH
 from estimation.frames import Array
 
 
@@ -88,18 +89,16 @@ class DeckForecaster:
         t_ns: int,
         heave: Array,
         P: Array,
-        parameters: Array,
+        motion: Array,
         learned: bool,
         sway: Array,
-        oscillator: Array,
     ) -> DeckForecast:
-        """Return the forecast from the heave states (6,), their covariance (6, 6) and parameters (7,) at ``t_ns``, and
-        from the sway's states (4,) with its angular frequency and damping ratio ``oscillator`` (2,).
+        """Return the forecast from the heave states (6,), their covariance (6, 6), the states of the sway (12,) and
+        the motion's parameters (22,) at ``t_ns``.
         """
-        both = np.concatenate([parameters, oscillator])
-        if self._parameters is None or not np.array_equal(both, self._parameters):
-            self._prepare(parameters, oscillator)
-            self._parameters = both
+        if self._parameters is None or not np.array_equal(motion, self._parameters):
+            self._prepare(motion)
+            self._parameters = motion.copy()
         assert self._rows is not None and self._spread is not None and self._sea is not None
         assert self._sway is not None
         mean = self._rows @ heave
@@ -111,25 +110,25 @@ class DeckForecaster:
         sigma = np.sqrt(variance)
         return DeckForecast(
             t_ns, self.horizon_s, mean[:, 0], sigma[:, 0], mean[:, 1], sigma[:, 1], skill,
-            math.sqrt(self._sea[1]), learned, self._sway @ sway.reshape(2, 2).T,
+            math.sqrt(self._sea[1]), learned, np.einsum("mak,ak->ma", self._sway, sway.reshape(2, BAND_SIZE)),
         )  # fmt: skip
 
-    def _prepare(self, parameters: Array, oscillator: Array) -> None:
+    def _prepare(self, motion: Array) -> None:
         """Fill rows (m, 2, 6) of height and rate, their own spread (m, 2) and the sea's variances (2,); and the rows
-        (m, 2) of the sway's velocity.
+        (m, 2, 6) of the sway's velocity north and east.
         """
         from scipy.linalg import expm
 
-        f, S = heave_matrix(parameters), heave_stationary(parameters)
-        seen = np.zeros((2, HEAVE_SIZE))
+        heave = motion[HEAVE : HEAVE + BAND_PARAMETERS]
+        f, S = band_matrix(heave), band_stationary(heave)
+        seen = np.zeros((2, BAND_SIZE))
         seen[0, 5] = 1.0
         seen[1] = f[5]
         self._rows = np.stack([seen @ expm(f * h) for h in self.horizon_s])
         self._sea = np.einsum("ki,ij,kj->k", seen, S, seen)
         self._spread = self._sea - np.einsum("mki,ij,mkj->mk", self._rows, S, self._rows)
-        w, zeta = oscillator
-        swing = np.array([[0.0, 1.0], [-w * w, -2.0 * zeta * w]])
-        self._sway = np.stack([expm(swing * h)[1] for h in self.horizon_s])
+        chains = [band_matrix(motion[c : c + BAND_PARAMETERS]) for c in (SWAY_NORTH, SWAY_EAST)]
+        self._sway = np.stack([[g[5] @ expm(g * h) for g in chains] for h in self.horizon_s])
 
 
 def _between(low: float, high: float, mean: float, sigma: float) -> float:

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from estimation.band import BAND_PARAMETERS, BAND_SIZE, band_stationary
 from estimation.config import Config
-from estimation.deck import MOTION_SIZE, SWAY_OMEGA, heave_stationary, prior_motion
+from estimation.deck import CHAINS, MOTION_SIZE, places, prior_motion
 from estimation.events import Kind
 from estimation.frames import (
     Array,
@@ -44,10 +45,8 @@ from estimation.state import (
     GPS_BIAS,
     GYRO_BIAS,
     P0,
-    PLATFORM_HEAVE,
     PLATFORM_LEVEL,
     PLATFORM_OFFSET,
-    PLATFORM_SWAY,
     POSITION,
     Q0,
     RANGE_SCALE,
@@ -456,12 +455,12 @@ class Aligner:
                 P[k, k] = P[d, d] + c.barometer.sigma_m**2
             else:
                 P[k, k] = 100.0**2
-        heave = np.zeros(MOTION_SIZE)
+        motion = np.zeros(MOTION_SIZE)
         if o[PLATFORM_OFFSET] >= 0:
-            heave = self._put_platform(P)
+            motion = self._put_platform(P)
         memory = np.zeros((self.sensors, MEMORY_SIZE))
         clock = np.array([t, t, t], dtype=np.int64)
-        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(4), memory, heave)
+        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(4), memory, motion, np.zeros(3))
 
     def _put_platform(self, P: Array) -> Array:
         """Write what is known of the platform before it is seen into P; return the parameters of its motion."""
@@ -474,14 +473,15 @@ class Aligner:
         radius = UNKNOWN_PLACE_M if d.anchor_radius_m is None else d.anchor_radius_m
         put(PLATFORM_OFFSET, np.eye(2) * radius**2)
         put(PLATFORM_LEVEL, np.eye(1) * UNKNOWN_LEVEL_M**2)
-        heave = prior_motion(d)
-        sway = d.sway_sigma_m**2 * np.array([1.0, heave[SWAY_OMEGA] ** 2])
-        put(PLATFORM_SWAY, np.diag(np.tile(sway, 2)))
-        put(PLATFORM_HEAVE, heave_stationary(heave))
+        motion = prior_motion(d)
+        for chain in CHAINS:
+            _, start = places(chain, o)
+            stationary = band_stationary(motion[chain : chain + BAND_PARAMETERS])
+            P[start : start + BAND_SIZE, start : start + BAND_SIZE] = stationary
         put(RANGE_SCALE, np.eye(1) * v.scale_sigma**2)
         put(CAMERA_LATENCY, np.eye(1) * v.latency_sigma_s**2)
         put(CAMERA_MOUNT, np.eye(3) * v.mount_sigma_rad**2)
-        return heave
+        return motion
 
 
 def _attitude_from(force: Array, up: Array, yaw: float) -> Array:

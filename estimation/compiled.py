@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numba.extending import overload, register_jitable
 
-from estimation import algebra, deck, frames, models, parameters, state, update, watch
+from estimation import algebra, band, deck, frames, models, parameters, state, update, watch
 from estimation import relinearise as relinearisation
 from estimation import rows as rows_module
 from estimation import trail as trail_module
@@ -30,8 +30,9 @@ from estimation.algebra import (
     joseph,
     reset_attitude,
 )
+from estimation.band import BAND_SIZE
 from estimation.codecache import jitted
-from estimation.deck import HEAVE_PARAMETERS, MOTION_SIZE, add_drift, change_motion, deck_output, seen_place
+from estimation.deck import HEAVE, add_drift, deck_output, seen_place, take_up
 from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
 from estimation.outcome import Outcome
@@ -53,7 +54,7 @@ from estimation.rows import (
     Int,
     Rows,
 )
-from estimation.state import ATTITUDE, PL0, PLATFORM_HEAVE, PLATFORM_SWAY, SIZES, Layout, Offsets, plus
+from estimation.state import ATTITUDE, P0, PL0, PLATFORM_HEAVE, PLATFORM_SWAY, SIZES, Layout, Offsets, plus
 from estimation.trail import AFTER, EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.update import (
     MAX_STEP_S,
@@ -115,13 +116,20 @@ def _put(target: Array, row: int, column: int, scale: float, block: Array) -> Ca
     return assign
 
 
-for _module in (algebra, deck, frames, models, relinearisation, state, update, watch):
+for _module in (algebra, band, deck, frames, models, relinearisation, state, update, watch):
     for _function in vars(_module).values():
         if (
             inspect.isfunction(_function)
             and _function.__module__ == _module.__name__
             and _function
-            not in (frames.compose, frames.rotate, models.put, deck.heave_stationary, deck.prior_motion)
+            not in (
+                frames.compose,
+                frames.rotate,
+                models.put,
+                band.band_stationary,
+                deck.any_sea,
+                deck.prior_motion,
+            )
         ):
             register_jitable(_function)
 
@@ -177,7 +185,7 @@ def _propagate_covariance(P: Array, F: Array, Q: Array, span: Int) -> None:
 def _spans(layout: Layout) -> Int:
     """Return the first and last-but-one column in which each row of F (n, 2) is not zero, behind the ninth row."""
     span = np.array([[i, i + 1] for i in range(layout.size)], dtype=np.int64)
-    for block, size in ((PLATFORM_SWAY, 2), (PLATFORM_HEAVE, 6)):
+    for block, size in ((PLATFORM_SWAY, BAND_SIZE), (PLATFORM_HEAVE, BAND_SIZE)):
         start = int(layout.offsets[block])
         if start >= 0:
             for i in range(start, start + SIZES[block]):
@@ -188,7 +196,7 @@ def _spans(layout: Layout) -> Int:
 
 def _propagate(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, t: int, t_imu: int, imu: Array, p: Array,
-    offsets: Offsets, F: Array, Q: Array, heave: Array, span: Int, chain: Array,
+    offsets: Offsets, F: Array, Q: Array, motion: Array, span: Int, chain: Array,
 ) -> Array:  # fmt: skip
     total = t - clock[0]
     if total <= 0:
@@ -200,7 +208,7 @@ def _propagate(
     for k in range(steps):
         middle = a + total * ((k + 0.5) / steps)
         mean = interpolate(imu0, clock[1], imu, t_imu, middle)
-        x = transition(x, mean[:3], mean[3:], dt, extra, p, offsets, F, Q, heave)
+        x = transition(x, mean[:3], mean[3:], dt, extra, p, offsets, F, Q, motion)
         _propagate_covariance(P, F, Q, span)
         if chain.shape[0] > 0:
             chain[:, :] = _transited(F, chain, span)
@@ -210,7 +218,7 @@ def _propagate(
 
 def _fuse(
     x: Array, P: Array, memory: Array, scatter: Array, kind: int, value: Array, own: Array, gyro: Array,
-    t_s: float, late: int, p: Array, offsets: Offsets, heave: Array, H: Array, result: Array,
+    t_s: float, late: int, p: Array, offsets: Offsets, motion: Array, moved: Array, H: Array, result: Array,
 ) -> tuple[int, int, Array]:  # fmt: skip
     r = np.zeros(3)
     R = np.zeros((3, 3))
@@ -233,11 +241,12 @@ def _fuse(
     result[1] = m
     if kind == VISION:
         seen_place(r, R, x, p, result[8:14])
-    result[15] = math.log(determinant(S, m))
+        result[15:18] = moved
+    result[18] = math.log(determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     mark = 0
-    if kind == VISION and unexplained(memory, t_s, r, S, w, x, p, heave):
+    if kind == VISION and unexplained(memory, t_s, r, S, w, x, p, motion):
         mark = LET_GO
     if w == 0.0:
         if locked_out(memory, kind, t_s, r, R, m, p):
@@ -274,14 +283,14 @@ def _fuse(
 
 
 def _open(
-    t: int, x: Array, P: Array, heave: Array, trail_count: Int, trail_t: Int, trail_marks: Int, trail_x: Array,
-    trail_P: Array, trail_chain: Array, trail_heave: Array,
+    t: int, x: Array, P: Array, motion: Array, trail_count: Int, trail_t: Int, trail_marks: Int, trail_x: Array,
+    trail_P: Array, trail_chain: Array, trail_motion: Array,
 ) -> None:  # fmt: skip
     """Begin a node of the trail; ``Trail.open`` in compiled code."""
     k = trail_count[0]
     trail_t[k] = t
     trail_marks[k, :] = 0
-    trail_heave[k] = heave
+    trail_motion[k] = motion
     for side in range(2):
         trail_x[k, side] = x
         trail_P[k, side] = P
@@ -297,11 +306,11 @@ register_jitable(_fuse)
 
 
 def _advance(
-    clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, heave: Array, p: Array,
-    offsets: Offsets, span: Int, ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array,
+    clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, motion: Array, moved: Array,
+    p: Array, offsets: Offsets, span: Int, ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array,
     out_sigma: Array, out_covariance: Array, out_deck: Array, out_deck_covariance: Array, count: int,
     emit_after_ns: int, period_ns: int, trail_count: Int, trail_t: Int, trail_marks: Int, trail_x: Array,
-    trail_P: Array, trail_chain: Array, trail_heave: Array,
+    trail_P: Array, trail_chain: Array, trail_motion: Array,
 ) -> int:  # fmt: skip
     n = P.shape[0]
     recording = len(trail_t) > 0
@@ -322,43 +331,42 @@ def _advance(
         if recording:
             chain = trail_chain[trail_count[0]]
         state = _propagate(
-            clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, heave, span, chain
+            clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, motion, span, chain
         )
         if ints[i, KIND] == HEAVE_MODEL:
             ints[i, OUTCOME] = _FUSED
-            if (ints[i, STAMP_NS] - clock[2]) * 1e-9 < scatter[3]:
+            before = (ints[i, STAMP_NS] - clock[2]) * 1e-9 < scatter[3]
+            if before and floats[i, OWN + 1] == HEAVE:
                 continue
-            motion = np.empty(MOTION_SIZE)
-            motion[0] = floats[i, OWN]
-            motion[1:HEAVE_PARAMETERS] = floats[i, VALUE:OWN]
-            motion[HEAVE_PARAMETERS:] = floats[i, OWN + 1 : OWN + 5]
-            change_motion(state, P, heave, motion, offsets, chain)
+            take_up(floats[i, VALUE:OWN], floats[i, OWN:RESULT], state, P, motion, offsets, chain)
             continue
         if i < following:
             gyro = interpolate(imu0, clock[1], imu, t_imu, t)[:3]
             t_s = (t - clock[2]) * 1e-9
             if recording:
                 x_before, P_before = state, P.copy()
+            place = state[P0 : P0 + 3].copy()
             ints[i, OUTCOME], ints[i, RESET], state = _fuse(
                 state, P, memory[ints[i, SENSOR]], scatter, ints[i, KIND], floats[i, VALUE:OWN],
-                floats[i, OWN:RESULT], gyro, t_s, ints[i, LATE], p, offsets, heave, H, floats[i, RESULT:],
+                floats[i, OWN:RESULT], gyro, t_s, ints[i, LATE], p, offsets, motion, moved, H, floats[i, RESULT:],
             )  # fmt: skip
+            moved += state[P0 : P0 + 3] - place
             if recording and ints[i, OUTCOME] <= _DOWNWEIGHTED:
                 if ints[i, RESET] == 1:
-                    _open(t, state, P, heave, trail_count, trail_t, trail_marks, trail_x, trail_P, trail_chain,
-                          trail_heave)  # fmt: skip
+                    _open(t, state, P, motion, trail_count, trail_t, trail_marks, trail_x, trail_P, trail_chain,
+                          trail_motion)  # fmt: skip
                     trail_marks[trail_count[0] - 1, RESET_KIND] = ints[i, KIND]
                     trail_marks[trail_count[0] - 1, RESET_SIZE] = int(floats[i, RESULT + 1])
                     continue
                 if trail_t[trail_count[0] - 1] != t:
-                    _open(t, x_before, P_before, heave, trail_count, trail_t, trail_marks, trail_x, trail_P,
-                          trail_chain, trail_heave)  # fmt: skip
+                    _open(t, x_before, P_before, motion, trail_count, trail_t, trail_marks, trail_x, trail_P,
+                          trail_chain, trail_motion)  # fmt: skip
                 trail_x[trail_count[0] - 1, AFTER] = state
                 trail_P[trail_count[0] - 1, AFTER] = P
             if ints[i, RESET] == LET_GO:
                 if recording:
                     chain = trail_chain[trail_count[0]]
-                let_go(t_s, state, P, memory[ints[i, SENSOR]], scatter, heave, p, offsets, chain)
+                let_go(t_s, state, P, memory[ints[i, SENSOR]], scatter, motion, p, offsets, chain)
             continue
         scatter_update(scatter, imu0, imu, (t - clock[1]) * 1e-9)
         new_period = period_ns == 0 or t // period_ns != clock[1] // period_ns
@@ -371,15 +379,15 @@ def _advance(
                 out_sigma[count, j] = math.sqrt(P[j, j])
             out_covariance[count] = P[:9, :9]
             if out_deck.shape[1] > 0:
-                y, A = deck_output(state, heave, offsets, n)
+                y, A = deck_output(state, motion, offsets, n)
                 out_deck[count] = y
                 congruence(A, P, out_deck_covariance[count])
-                add_drift(heave, out_deck_covariance[count])
+                add_drift(motion, out_deck_covariance[count])
             count += 1
             if recording:
                 if trail_t[trail_count[0] - 1] != t:
-                    _open(t, state, P, heave, trail_count, trail_t, trail_marks, trail_x, trail_P, trail_chain,
-                          trail_heave)  # fmt: skip
+                    _open(t, state, P, motion, trail_count, trail_t, trail_marks, trail_x, trail_P, trail_chain,
+                          trail_motion)  # fmt: skip
                 trail_marks[trail_count[0] - 1, EMITS] = 1
         following = i + 1
     x[:] = state
@@ -431,8 +439,8 @@ class CompiledEngine:
         """Process the rows start..stop in order; see ``FilterPyEngine.advance``."""
         s, trail = self.state, self.trail
         out.count = _kernel(
-            s.clock, s.x, s.P, s.imu, s.scatter, s.memory, s.heave, self.p, self.layout.offsets, self.span,
+            s.clock, s.x, s.P, s.imu, s.scatter, s.memory, s.motion, s.moved, self.p, self.layout.offsets, self.span,
             rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.deck,
             out.deck_covariance, out.count, emit_after_ns, period_ns, trail.count, trail.t_ns, trail.marks,
-            trail.nominal, trail.covariance, trail.chain, trail.heave,
+            trail.nominal, trail.covariance, trail.chain, trail.motion,
         )  # fmt: skip

@@ -282,9 +282,11 @@ class PlatformConfig(_Table, frozen=True):
             "r_plat: 1-sigma of the place about the configured origin; None: known from vision only", "m"
         ),
     ] = None
-    sway_sigma_m: Annotated[float, _positive("stationary 1-sigma of the sway, per axis", "m")] = 0.15
-    sway_period_s: Annotated[float, _positive("period of the sway", "s")] = 4.0
-    sway_damping: Annotated[float, _positive("damping ratio of the sway", "-")] = 0.3
+    sway_sigma_m: Annotated[
+        float, _positive("stationary 1-sigma of the sway before it is learned, per axis", "m")
+    ] = 0.15
+    sway_period_s: Annotated[float, _positive("middle period of the sway before it is learned", "s")] = 4.0
+    sway_damping: Annotated[float, _positive("damping ratio of the sway's sections", "-")] = 0.5
     level_walk: Annotated[
         float,
         _not_negative(

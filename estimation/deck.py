@@ -1,12 +1,11 @@
 """Models of the platform: how it moves, how a camera sees it, and where it is relative to the vehicle.
 
 Plain functions of arrays that numba compiles as they stand. The platform is an anchored place (random walk), sway
-about it (a damped oscillator per axis), a level (random walk, positive up) and heave: white noise through three
-sections s / (s^2 + 2 zeta w s + w^2), so that it has no gain at rest and leaves the level to its own state.
+about it to north and east, a level (random walk, positive up) and heave about it. Sway and heave are chains
+(``estimation.band``), which have no gain at rest and leave place and level to their own states.
 
-``heave`` are the eleven parameters of this motion, which are learned in flight: of heave the gain, three w [rad/s],
-three zeta (``estimation.heave.bandpass``); of sway the 1-sigma [m] north and east and w; of the place its random walk
-[m/rts].
+``motion`` are the parameters of this motion (22,), which are learned in flight: seven each of heave, sway north and
+sway east, in this order, and the random walk of the place [m/rts].
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import math
 import numpy as np
 
 from estimation import parameters as par
+from estimation.band import BAND_PARAMETERS, BAND_SIZE, band_matrix, band_stationary, change_of_band
 from estimation.config import PlatformConfig
 from estimation.frames import Array, compose, quat_exp, quat_to_matrix, rotate, skew
 from estimation.state import (
@@ -42,12 +42,11 @@ from estimation.state import (
     Offsets,
 )
 
-HEAVE_SIZE = 6
-HEAVE_PARAMETERS = 7
-SWAY_NORTH, SWAY_EAST, SWAY_OMEGA, OFFSET_WALK = 7, 8, 9, 10
-MOTION_SIZE = 11
+HEAVE, SWAY_NORTH, SWAY_EAST, OFFSET_WALK, MOTION_SIZE = 0, 7, 14, 21, 22
+"""First places in ``motion`` of the parameters of each chain, then of the place's random walk, and their number."""
+CHAINS = (HEAVE, SWAY_NORTH, SWAY_EAST)
 ANY_SEA = np.array([1.0 / 1.6, 1.0, 1.6])
-"""Frequencies of the sections of a heave without a form of its own, over their middle: with a damping of 0.5, short
+"""Frequencies of the sections of a motion without a form of its own, over their middle: with a damping of 0.5, short
 wind sea and swell both lie within what it expects."""
 DRIFT_TIME_S = 3.0
 """After so long a random walk of the place is as far as the steady velocity that it stands for takes it [s]."""
@@ -55,216 +54,92 @@ OUTPUT_SIZE = 8
 """Relative position (3), relative velocity (3), height and its rate."""
 
 
-def heave_matrix(heave: Array) -> Array:
-    """Return f (6, 6) of x' = f x + l w: states of a section are its displacement and velocity."""
-    f = np.zeros((HEAVE_SIZE, HEAVE_SIZE))
-    for s in range(3):
-        w, zeta = heave[1 + s], heave[4 + s]
-        f[2 * s, 2 * s + 1] = 1.0
-        f[2 * s + 1, 2 * s] = -w * w
-        f[2 * s + 1, 2 * s + 1] = -2.0 * zeta * w
-        if s > 0:
-            f[2 * s + 1, 2 * s - 1] = 1.0
-    return f
-
-
-def heave_stationary(heave: Array) -> Array:
-    """Return the covariance (6, 6) of the heave's states once it has run for long."""
-    from scipy.linalg import solve_continuous_lyapunov
-
-    drive = np.zeros((HEAVE_SIZE, HEAVE_SIZE))
-    drive[1, 1] = heave[0] ** 2
-    covariance = solve_continuous_lyapunov(heave_matrix(heave), -drive)
-    return np.asarray(0.5 * (covariance + covariance.T))
-
-
 def prior_motion(platform: PlatformConfig) -> Array:
-    """Return the parameters of the motion (11,) before it is learned: a heave of any sea, spread about a period."""
-    omega = 2.0 * math.pi / platform.heave_period_s
-    heave = np.array([1.0, *(omega * ANY_SEA), *[platform.heave_damping] * 3])
-    heave[0] = platform.heave_sigma_m / math.sqrt(heave_stationary(heave)[5, 5])
-    sway = platform.sway_sigma_m
-    return np.array([*heave, sway, sway, 2.0 * math.pi / platform.sway_period_s, platform.offset_walk])
+    """Return the parameters of the motion (22,) before it is learned: chains of any sea, spread about their periods."""
+    heave = any_sea(platform.heave_sigma_m, 2.0 * math.pi / platform.heave_period_s, platform.heave_damping)
+    sway = any_sea(platform.sway_sigma_m, 2.0 * math.pi / platform.sway_period_s, platform.sway_damping)
+    return np.array([*heave, *sway, *sway, platform.offset_walk])
 
 
-def heave_derivatives(x: Array, heave: Array) -> Array:
-    """Return (6,) the heave's third, second and first integral, itself, its first and second derivative.
+def any_sea(sigma_m: float, omega_radps: float, damping: float) -> Array:
+    """Return the parameters of a chain (7,) without a form of its own: its size, middle frequency and dampings."""
+    band = np.array([1.0, *(omega_radps * ANY_SEA), damping, damping, damping])
+    band[0] = sigma_m / math.sqrt(band_stationary(band)[5, 5])
+    return band
 
-    With z = w / ((s^2 + a s + b) ...), the white noise through the denominators alone, the heave is z's third
-    derivative: z and its five derivatives are the chain's states (6,) in coordinates that mean the same for any
-    parameters.
+
+def places(chain: int, offsets: Offsets) -> tuple[int, int]:
+    """Return where the states of the chain whose parameters begin at ``chain`` begin: nominal state, error state."""
+    if chain == HEAVE:
+        return PH0, offsets[PLATFORM_HEAVE]
+    east = BAND_SIZE if chain == SWAY_EAST else 0
+    return PS0 + east, offsets[PLATFORM_SWAY] + east
+
+
+def change_motion(
+    x: Array, P: Array, motion: Array, chain: int, new: Array, offsets: Offsets, trail: Array
+) -> None:
+    """Go over to new parameters (7,) of one chain, in place (``change_of_band``: P stays positive).
+
+    ``trail`` (n, n), where it is not empty, is the transition since the last node of a trail.
     """
-    z = np.empty(HEAVE_SIZE)
-    a2, b2 = 2.0 * heave[5] * heave[2], heave[2] ** 2
-    a3, b3 = 2.0 * heave[6] * heave[3], heave[3] ** 2
-    z[2], z[3] = x[4], x[5]
-    z[4] = x[3] - a3 * z[3] - b3 * z[2]
-    z[1] = (x[2] - z[3] - a3 * z[2]) / b3
-    z[0] = ((x[0] - x[3] - a2 * x[2]) / b2 - z[2] - a3 * z[1]) / b3
-    z[5] = x[1] - a2 * x[3] - b2 * x[2] - a3 * z[4] - b3 * z[3]
-    return z
-
-
-def heave_states(z: Array, heave: Array) -> Array:
-    """Return the chain's states (6,); the inverse of ``heave_derivatives``."""
-    x = np.empty(HEAVE_SIZE)
-    a2, b2 = 2.0 * heave[5] * heave[2], heave[2] ** 2
-    a3, b3 = 2.0 * heave[6] * heave[3], heave[3] ** 2
-    x[4], x[5] = z[2], z[3]
-    x[2] = z[3] + a3 * z[2] + b3 * z[1]
-    x[3] = z[4] + a3 * z[3] + b3 * z[2]
-    x[0] = x[3] + a2 * x[2] + b2 * (z[2] + a3 * z[1] + b3 * z[0])
-    x[1] = z[5] + a3 * z[4] + b3 * z[3] + a2 * x[3] + b2 * x[2]
-    return x
-
-
-def heave_moments(heave: Array) -> Array:
-    """Return (6,) the variances of z and its five derivatives (``heave_derivatives``) in a sea without end.
-
-    E[z_i z_j] is (-1)^((i - j) / 2) m_((i + j) / 2) for even i + j, else 0; the z_k are uncorrelated with the noise
-    that drives z_6, but for k = 5: six linear equations for the six moments m. Time is in units of the sections'.
-    """
-    scale = (heave[1] * heave[2] * heave[3]) ** (1.0 / 3.0)
-    polynomial = np.zeros(HEAVE_SIZE + 1)
-    polynomial[0] = 1.0
-    for s in range(3):
-        w = heave[1 + s] / scale
-        a = 2.0 * heave[4 + s] * w
-        for k in range(2 * s + 2, -1, -1):
-            value = w * w * polynomial[k]
-            if k >= 1:
-                value += a * polynomial[k - 1]
-            if k >= 2:
-                value += polynomial[k - 2]
-            polynomial[k] = value
-    M = np.zeros((HEAVE_SIZE, HEAVE_SIZE + 1))
-    for k in range(HEAVE_SIZE):
-        for j in range(k % 2, HEAVE_SIZE + 1, 2):
-            sign = 1.0 if (j - k) % 4 == 0 else -1.0
-            M[k, (k + j) // 2] += sign * polynomial[j]
-    M[HEAVE_SIZE - 1, HEAVE_SIZE] = 0.5 * heave[0] ** 2
-    m = _solved(M)
-    for k in range(HEAVE_SIZE):
-        m[k] *= scale ** (2 * k - 11)
-    return m
-
-
-def _solved(M: Array) -> Array:
-    """Return the solution (n,) of the equations (n, n + 1) with their right sides last, by elimination."""
-    n = M.shape[0]
-    for c in range(n):
-        best = c
-        for i in range(c + 1, n):
-            if abs(M[i, c]) > abs(M[best, c]):
-                best = i
-        for k in range(c, n + 1):
-            M[c, k], M[best, k] = M[best, k], M[c, k]
-        for i in range(n):
-            if i != c:
-                factor = M[i, c] / M[c, c]
-                for k in range(c, n + 1):
-                    M[i, k] -= factor * M[c, k]
-    solution = np.empty(n)
-    for i in range(n):
-        solution[i] = M[i, n] / M[i, i]
-    return solution
-
-
-def _integrals(heave: Array) -> Array:
-    """Return what a sea without end says of the heave's integrals (z, z', z'') from itself, its rate and acceleration:
-    (8,) z on the rate, z' on heave and acceleration, z'' on the rate; then of what remains 1-sigma of z', of z'', z on
-    z'' and 1-sigma of z.
-    """
-    m = heave_moments(heave)
-    tiny = 1e-12
-    out = np.empty(8)
-    det = m[3] * m[5] - m[4] ** 2
-    out[0] = m[2] / m[4]
-    out[1] = (m[3] * m[4] - m[2] * m[5]) / det
-    out[2] = (m[3] ** 2 - m[2] * m[4]) / det
-    out[3] = -m[3] / m[4]
-    out[4] = math.sqrt(max(m[1] + out[1] * m[2] - out[2] * m[3], tiny * m[1]))
-    second = max(m[2] - m[3] ** 2 / m[4], tiny * m[2])
-    both = -m[1] + m[2] * m[3] / m[4]
-    out[5] = math.sqrt(second)
-    out[6] = both / second
-    out[7] = math.sqrt(max(m[0] - m[2] ** 2 / m[4] - both**2 / second, tiny * m[0]))
-    return out
-
-
-def change_motion(x: Array, P: Array, heave: Array, new: Array, offsets: Offsets, chain: Array) -> None:
-    """Go over to new parameters of the motion, in place; ``chain`` (n, n), where it is not empty, is the transition
-    since the last node of a trail.
-
-    The chain's states mean something else under other parameters. Heave, its rate and its acceleration stay what they
-    are, with their covariance. Its integrals, which have no meaning beyond the chain's and whose size is the model's,
-    stay where they were within what the sea says of them: what of them the heave does not tell keeps its value in
-    units of its own 1-sigma. So nothing changes with equal parameters, and P stays positive.
-    """
-    start = offsets[PLATFORM_HEAVE]
-    old_sea, new_sea = _integrals(heave), _integrals(new)
-    T = np.empty((HEAVE_SIZE, HEAVE_SIZE))
-    for c in range(HEAVE_SIZE):
-        unit = np.zeros(HEAVE_SIZE)
-        unit[c] = 1.0
-        z = heave_derivatives(unit, heave)
-        rest1 = (z[1] - old_sea[1] * z[3] - old_sea[2] * z[5]) / old_sea[4]
-        rest2 = (z[2] - old_sea[3] * z[4]) / old_sea[5]
-        rest0 = (z[0] - old_sea[0] * z[4] - old_sea[6] * old_sea[5] * rest2) / old_sea[7]
-        z[1] = new_sea[1] * z[3] + new_sea[2] * z[5] + new_sea[4] * rest1
-        z[2] = new_sea[3] * z[4] + new_sea[5] * rest2
-        z[0] = new_sea[0] * z[4] + new_sea[6] * new_sea[5] * rest2 + new_sea[7] * rest0
-        T[:, c] = heave_states(z, new)
-    x[PH0 : PH0 + HEAVE_SIZE] = _turned(T, x[PH0 : PH0 + HEAVE_SIZE].copy())
+    at, start = places(chain, offsets)
+    T = change_of_band(motion[chain : chain + BAND_PARAMETERS], new)
+    x[at : at + BAND_SIZE] = _turned(T, x[at : at + BAND_SIZE].copy())
     for c in range(P.shape[0]):
-        P[start : start + HEAVE_SIZE, c] = _turned(T, P[start : start + HEAVE_SIZE, c].copy())
+        P[start : start + BAND_SIZE, c] = _turned(T, P[start : start + BAND_SIZE, c].copy())
     for c in range(P.shape[0]):
-        P[c, start : start + HEAVE_SIZE] = _turned(T, P[c, start : start + HEAVE_SIZE].copy())
-    for c in range(chain.shape[0]):
-        chain[start : start + HEAVE_SIZE, c] = _turned(T, chain[start : start + HEAVE_SIZE, c].copy())
+        P[c, start : start + BAND_SIZE] = _turned(T, P[c, start : start + BAND_SIZE].copy())
+    for c in range(trail.shape[0]):
+        trail[start : start + BAND_SIZE, c] = _turned(T, trail[start : start + BAND_SIZE, c].copy())
     for i in range(P.shape[0]):
         for c in range(i):
             mean = 0.5 * (P[i, c] + P[c, i])
             P[i, c] = mean
             P[c, i] = mean
-    heave[:] = new
+    motion[chain : chain + BAND_PARAMETERS] = new
+
+
+def take_up(
+    value: Array, own: Array, x: Array, P: Array, motion: Array, offsets: Offsets, trail: Array
+) -> None:
+    """Take up what was learned of a chain, from a row: ``own`` (6,) its gain, its first place in ``motion`` and the
+    place's random walk, ``value`` (6,) its other parameters.
+    """
+    new = np.empty(BAND_PARAMETERS)
+    new[0] = own[0]
+    new[1:] = value
+    change_motion(x, P, motion, int(own[1]), new, offsets, trail)
+    motion[OFFSET_WALK] = own[2]
 
 
 def _turned(T: Array, v: Array) -> Array:
     """Return T v (6,), in one order of summation for both engines."""
-    out = np.zeros(HEAVE_SIZE)
-    for i in range(HEAVE_SIZE):
-        for k in range(HEAVE_SIZE):
+    out = np.zeros(BAND_SIZE)
+    for i in range(BAND_SIZE):
+        for k in range(BAND_SIZE):
             out[i] += T[i, k] * v[k]
     return out
 
 
 def deck_transition(
-    x: Array, y: Array, dt: float, p: Array, heave: Array, offsets: Offsets, F: Array, Q: Array
+    x: Array, y: Array, dt: float, p: Array, motion: Array, offsets: Offsets, F: Array, Q: Array
 ) -> None:
     """Propagate the platform's blocks from ``x`` into ``y`` over ``dt`` [s]; fill their places in F and Q.
 
-    The oscillators' transition is a series to third order in dt, the noise Simpson's rule over the step: both good to
+    The chains' transition is a series to third order in dt, the noise Simpson's rule over the step: both good to
     1e-5 for steps up to 25 ms and periods above 0.8 s.
     """
     o = offsets[PLATFORM_OFFSET]
     for i in range(2):
-        Q[o + i, o + i] = heave[OFFSET_WALK] ** 2 * dt
+        Q[o + i, o + i] = motion[OFFSET_WALK] ** 2 * dt
     level = offsets[PLATFORM_LEVEL]
     Q[level, level] = p[par.LEVEL_WALK] ** 2 * dt
-    w, zeta = heave[SWAY_OMEGA], p[par.SWAY_ZETA]
-    f = np.zeros((2, 2))
-    f[0, 1] = 1.0
-    f[1, 0] = -w * w
-    f[1, 1] = -2.0 * zeta * w
-    # Stationary variance sigma^2 of a damped oscillator needs white noise of density 4 zeta w^3 sigma^2.
-    drive = np.zeros(2)
-    for axis in range(2):
-        drive[1] = 2.0 * heave[SWAY_NORTH + axis] * w * math.sqrt(zeta * w)
-        _fill(x, y, PS0 + 2 * axis, f, drive, dt, F, Q, offsets[PLATFORM_SWAY] + 2 * axis)
-    drive6 = np.zeros(HEAVE_SIZE)
-    drive6[1] = heave[0]
-    _fill(x, y, PH0, heave_matrix(heave), drive6, dt, F, Q, offsets[PLATFORM_HEAVE])
+    drive = np.zeros(BAND_SIZE)
+    for chain in CHAINS:
+        drive[1] = motion[chain]
+        at, start = places(chain, offsets)
+        _fill(x, y, at, band_matrix(motion[chain : chain + BAND_PARAMETERS]), drive, dt, F, Q, start)
     latency = offsets[CAMERA_LATENCY]
     Q[latency, latency] = p[par.LATENCY_WALK] ** 2 * dt
 
@@ -272,7 +147,7 @@ def deck_transition(
 def _fill(
     x: Array, y: Array, place: int, f: Array, drive: Array, dt: float, F: Array, Q: Array, start: int
 ) -> None:
-    """Discretise one oscillator: transition into F, noise into Q, nominal state from x into y."""
+    """Discretise one chain: transition into F, noise into Q, nominal state from x into y."""
     n = f.shape[0]
     for c in range(n):
         column = np.zeros(n)
@@ -322,8 +197,8 @@ def vision(
     R_cb = p[par.VISION_MOUNT : par.VISION_MOUNT + 9].copy().reshape(3, 3)
     R_cm = compose(R_cb, quat_to_matrix(quat_exp(x[CM0 : CM0 + 3])).T.copy())
     d = np.empty(3)
-    d[0] = x[PO0] + x[PS0] - x[P0]
-    d[1] = x[PO0 + 1] + x[PS0 + 2] - x[P0 + 1]
+    d[0] = x[PO0] + x[PS0 + 5] - x[P0]
+    d[1] = x[PO0 + 1] + x[PS0 + 11] - x[P0 + 1]
     d[2] = -x[PL0] - x[PH0 + 5] - x[P0 + 2]
     b = rotate(R_bn, d)
     seen = b - p[par.VISION_LEVER : par.VISION_LEVER + 3]
@@ -341,7 +216,7 @@ def vision(
             H[i, offsets[CAMERA_MOUNT] + j] = scale * M[i, j]
         for axis in range(2):
             H[i, offsets[PLATFORM_OFFSET] + axis] = scale * D[i, axis]
-            H[i, offsets[PLATFORM_SWAY] + 2 * axis] = scale * D[i, axis]
+            H[i, offsets[PLATFORM_SWAY] + 6 * axis + 5] = scale * D[i, axis]
         H[i, offsets[PLATFORM_LEVEL]] = -scale * D[i, 2]
         H[i, offsets[PLATFORM_HEAVE] + 5] = -scale * D[i, 2]
         H[i, offsets[RANGE_SCALE]] = c[i]
@@ -387,45 +262,47 @@ def seen_place(r: Array, R: Array, x: Array, p: Array, seen: Array) -> None:
         if axis == 0:
             seen[0] = x[PL0] + x[PH0 + 5] - shift
         else:
-            seen[2 * axis] = x[PO0 + row] + x[PS0 + 2 * row] + shift
+            seen[2 * axis] = x[PO0 + row] + x[PS0 + 6 * row + 5] + shift
         seen[2 * axis + 1] = variance
 
 
-def deck_output(x: Array, heave: Array, offsets: Offsets, n: int) -> tuple[Array, Array]:
+def deck_output(x: Array, motion: Array, offsets: Offsets, n: int) -> tuple[Array, Array]:
     """Return what is reported of the platform, (8,), and its Jacobian by the error state, (8, n).
 
     Relative position P_uav - P_platform [m] and velocity [m/s] in NED, the deck's height [m] and its rate [m/s] up.
     """
-    f = heave_matrix(heave)
     y = np.zeros(OUTPUT_SIZE)
     A = np.zeros((OUTPUT_SIZE, n))
-    rate = 0.0
-    for k in range(HEAVE_SIZE):
-        rate += f[5, k] * x[PH0 + k]
-        A[7, offsets[PLATFORM_HEAVE] + k] = f[5, k]
-        A[5, offsets[PLATFORM_HEAVE] + k] = f[5, k]
-    y[6] = x[PL0] + x[PH0 + 5]
-    y[7] = rate
-    A[6, offsets[PLATFORM_LEVEL]] = 1.0
-    A[6, offsets[PLATFORM_HEAVE] + 5] = 1.0
-    for axis in range(2):
-        y[axis] = x[P0 + axis] - x[PO0 + axis] - x[PS0 + 2 * axis]
-        y[3 + axis] = x[V0 + axis] - x[PS0 + 2 * axis + 1]
-        A[axis, offsets[PLATFORM_OFFSET] + axis] = -1.0
-        A[axis, offsets[PLATFORM_SWAY] + 2 * axis] = -1.0
-        A[3 + axis, offsets[PLATFORM_SWAY] + 2 * axis + 1] = -1.0
     for axis in range(3):
+        # A platform that goes up comes nearer: P is positive down, heave positive up.
+        y[axis], y[3 + axis] = x[P0 + axis], x[V0 + axis]
         A[axis, offsets[POSITION] + axis] = 1.0
         A[3 + axis, offsets[VELOCITY] + axis] = 1.0
-    y[2] = x[P0 + 2] + y[6]
-    y[5] = x[V0 + 2] + rate
-    A[2, offsets[PLATFORM_LEVEL]] = 1.0
-    A[2, offsets[PLATFORM_HEAVE] + 5] = 1.0
+        chain = (SWAY_NORTH, SWAY_EAST, HEAVE)[axis]
+        sign = 1.0 if chain == HEAVE else -1.0
+        at, start = places(chain, offsets)
+        rate = band_matrix(motion[chain : chain + BAND_PARAMETERS])[5]
+        y[axis] += sign * x[at + 5]
+        A[axis, start + 5] = sign
+        for k in range(BAND_SIZE):
+            y[3 + axis] += sign * rate[k] * x[at + k]
+            A[3 + axis, start + k] = sign * rate[k]
+            if chain == HEAVE:
+                y[7] += rate[k] * x[at + k]
+                A[7, start + k] = rate[k]
+    for axis in range(2):
+        y[axis] -= x[PO0 + axis]
+        A[axis, offsets[PLATFORM_OFFSET] + axis] = -1.0
+    y[2] += x[PL0]
+    y[6] = x[PL0] + x[PH0 + 5]
+    for row in (2, 6):
+        A[row, offsets[PLATFORM_LEVEL]] = 1.0
+    A[6, offsets[PLATFORM_HEAVE] + 5] = 1.0
     return y, A
 
 
-def add_drift(heave: Array, covariance: Array) -> None:
+def add_drift(motion: Array, covariance: Array) -> None:
     """Add to the covariance of what is reported, (8, 8), the velocity of the place's drift, which is no state."""
-    variance = heave[OFFSET_WALK] ** 2 / DRIFT_TIME_S
+    variance = motion[OFFSET_WALK] ** 2 / DRIFT_TIME_S
     covariance[3, 3] += variance
     covariance[4, 4] += variance

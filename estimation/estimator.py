@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from estimation.ahead import DeckForecast, DeckForecaster
 from estimation.alignment import Aligner
+from estimation.band import BAND_PARAMETERS, BAND_SIZE
 from estimation.clockbank import ClockBank, ClockSummary
 from estimation.config import Config, ConfigError
-from estimation.deck import HEAVE_PARAMETERS, HEAVE_SIZE, SWAY_OMEGA, prior_motion
+from estimation.deck import HEAVE, prior_motion
 from estimation.events import (
     AUTOPILOT,
     COMPANION,
@@ -197,13 +198,10 @@ class LandingEstimator:
         if self._engine is None or start < 0:
             return None
         s = self._engine.state
-        block = slice(start, start + HEAVE_SIZE)
-        learned = self._learner is not None and self._learner.block is not None
-        x = s.x[PH0 : PH0 + HEAVE_SIZE]
-        c = self.config.platform
-        swing = np.array([s.heave[SWAY_OMEGA], c.sway_damping])
-        sway, heave = s.x[PS0 : PS0 + 4], s.heave[:HEAVE_PARAMETERS]
-        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], heave, learned, sway, swing)
+        block = slice(start, start + BAND_SIZE)
+        learned = self._learner is not None and HEAVE in self._learner.blocks
+        x, sway = s.x[PH0 : PH0 + BAND_SIZE], s.x[PS0 : PS0 + 2 * BAND_SIZE]
+        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], s.motion, learned, sway)
 
     def finish(self) -> None:
         """Settle what is still in the window; measurements that no inertial sample followed were in the future."""
@@ -417,16 +415,17 @@ class LandingEstimator:
         """Learn the platform's motion from fixes that are final; the filter takes the result up a fixed time later, so
         that neither the order of arrival nor the size of a batch shows."""
         assert self._learner is not None
-        for due_ns, model, parameters in self._learner.take(settled):
+        for due_ns, model, changed in self._learner.take(settled):
             self._heave.append((due_ns, model))
-            row = Rows.empty(1)
-            row.t_ns[0] = due_ns + self._history.window_ns + TAKE_UP_NS
-            row.kind[0] = HEAVE_MODEL
-            row.stamp_ns[0] = due_ns
-            row.own[0, 0], row.value[0] = parameters[0], parameters[1:HEAVE_PARAMETERS]
-            row.own[0, 1:5] = parameters[HEAVE_PARAMETERS:]
-            row.id[0] = -1
-            self._history.insert(row)
+            for chain, parameters in changed.items():
+                row = Rows.empty(1)
+                row.t_ns[0] = due_ns + self._history.window_ns + TAKE_UP_NS
+                row.kind[0] = HEAVE_MODEL
+                row.stamp_ns[0] = due_ns
+                row.own[0, :3] = parameters[0], chain, parameters[BAND_PARAMETERS]
+                row.value[0] = parameters[1:BAND_PARAMETERS]
+                row.id[0] = -1
+                self._history.insert(row)
 
     def _feed_before_start(self, row: Rows) -> None:
         h = self._history

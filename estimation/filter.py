@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimation import models, update
-from estimation.deck import add_drift, change_motion, deck_output, seen_place
+from estimation.deck import HEAVE, add_drift, deck_output, seen_place, take_up
 from estimation.frames import Array
 from estimation.outcome import Outcome
 from estimation.relinearise import moved_far, relinearise
 from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
-from estimation.state import ATTITUDE, PL0, Layout, plus
+from estimation.state import ATTITUDE, P0, PL0, Layout, plus
 from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.watch import LET_GO, let_go, unexplained
 
@@ -84,16 +84,17 @@ class FilterPyEngine:
             self._propagate(t, t_imu, imu)
             if rows.kind[i] == HEAVE_MODEL:
                 rows.outcome[i] = Outcome.FUSED
-                if (int(rows.stamp_ns[i]) - int(s.clock[2])) * 1e-9 < s.scatter[3]:
+                before = (int(rows.stamp_ns[i]) - int(s.clock[2])) * 1e-9 < s.scatter[3]
+                if before and rows.own[i, 1] == HEAVE:
                     continue
-                motion = np.concatenate((rows.own[i, :1], rows.value[i], rows.own[i, 1:5]))
                 chain = self.trail.chain[self.trail.count[0]] if self.trail.on else np.empty((0, 0))
-                change_motion(s.x, s.P, s.heave, motion, self.layout.offsets, chain)
+                take_up(rows.value[i], rows.own[i], s.x, s.P, s.motion, self.layout.offsets, chain)
                 continue
             if i < following:
                 gyro = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, t)[:3]
-                x, P = s.x, s.P
+                x, P, place = s.x, s.P, s.x[P0 : P0 + 3].copy()
                 self._fuse(rows, i, gyro)
+                s.moved += s.x[P0 : P0 + 3] - place
                 if self.trail.on:
                     self._record(rows, i, x, P)
                 if rows.reset[i] == LET_GO:
@@ -106,7 +107,7 @@ class FilterPyEngine:
             if t > emit_after_ns and new_period:
                 self._write(out, t)
                 if self.trail.on:
-                    self.trail.reach(t, s.x, s.P, s.heave)
+                    self.trail.reach(t, s.x, s.P, s.motion)
                     self.trail.marks[self.trail.count[0] - 1, EMITS] = 1
             following = i + 1
 
@@ -125,7 +126,7 @@ class FilterPyEngine:
             middle = a + total * ((k + 0.5) / steps)
             mean = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, middle)
             s.x = models.transition(
-                s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q, s.heave
+                s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q, s.motion
             )
             self.ekf.P = s.P
             self.ekf.F = F
@@ -170,8 +171,9 @@ class FilterPyEngine:
         rows.log_det[i] = np.linalg.slogdet(S)[1]
         if kind == models.VISION:
             seen_place(r, R, s.x, self.p, rows.seen[i])
+            rows.seen[i, 7:10] = s.moved
         w = update.weight(nis, m, self.p)
-        if kind == models.VISION and unexplained(memory, t_s, r, S, w, s.x, self.p, s.heave):
+        if kind == models.VISION and unexplained(memory, t_s, r, S, w, s.x, self.p, s.motion):
             rows.reset[i] = LET_GO
         if w == 0.0:
             rows.outcome[i] = Outcome.REJECTED_GATE
@@ -218,7 +220,7 @@ class FilterPyEngine:
         t_s = (int(rows.t_ns[i]) - int(s.clock[2])) * 1e-9
         chain = self.trail.chain[self.trail.count[0]] if self.trail.on else np.empty((0, 0))
         memory = s.memory[rows.sensor[i]]
-        let_go(t_s, s.x, s.P, memory, s.scatter, s.heave, self.p, self.layout.offsets, chain)
+        let_go(t_s, s.x, s.P, memory, s.scatter, s.motion, self.p, self.layout.offsets, chain)
 
     def _record(self, rows: Rows, i: int, x: Array, P: Array) -> None:
         """Note a measurement that was fused, with the state before it."""
@@ -226,11 +228,11 @@ class FilterPyEngine:
         if rows.outcome[i] > Outcome.DOWNWEIGHTED:
             return
         if rows.reset[i] == 1:
-            trail.open(int(rows.t_ns[i]), s.x, s.P, s.heave)
+            trail.open(int(rows.t_ns[i]), s.x, s.P, s.motion)
             trail.marks[trail.count[0] - 1, RESET_KIND] = rows.kind[i]
             trail.marks[trail.count[0] - 1, RESET_SIZE] = int(rows.result[i, 1])
             return
-        trail.reach(int(rows.t_ns[i]), x, P, s.heave)
+        trail.reach(int(rows.t_ns[i]), x, P, s.motion)
         trail.close(s.x, s.P)
 
     def _write(self, out: Estimates, t: int) -> None:
@@ -240,9 +242,9 @@ class FilterPyEngine:
         out.sigma[k] = np.sqrt(np.diag(s.P))
         out.covariance[k] = s.P[:9, :9]
         if out.deck.shape[1]:
-            out.deck[k], A = deck_output(s.x, s.heave, self.layout.offsets, self.layout.size)
+            out.deck[k], A = deck_output(s.x, s.motion, self.layout.offsets, self.layout.size)
             out.deck_covariance[k] = A @ s.P @ A.T
-            add_drift(s.heave, out.deck_covariance[k])
+            add_drift(s.motion, out.deck_covariance[k])
         out.count = k + 1
 
 

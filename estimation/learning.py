@@ -1,7 +1,8 @@
 """Learning the platform's motion in flight: from the fixes that are final to the parameters of the filter's blocks.
 
 Heave is learned often, and reported; sway and the drift of the place, which only the filter uses, in turn and less
-often. All three are spectra learned from where each fix shows the deck (``estimation.heave``).
+often. All three are spectra learned from where each fix shows the deck (``estimation.heave``), and taken up as chains
+(``estimation.band``).
 """
 
 from __future__ import annotations
@@ -11,16 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimation.deck import (
-    ANY_SEA,
-    DRIFT_TIME_S,
-    HEAVE_PARAMETERS,
-    OFFSET_WALK,
-    SWAY_NORTH,
-    SWAY_OMEGA,
-    heave_matrix,
-    heave_stationary,
-)
+from estimation.band import BAND_PARAMETERS, band_matrix, band_stationary
+from estimation.deck import CHAINS, DRIFT_TIME_S, HEAVE, OFFSET_WALK, any_sea
 from estimation.events import Kind
 from estimation.frames import Array
 from estimation.heave.bandpass import BandPass
@@ -46,8 +39,10 @@ SWAY_S = 12.0
 """Shortest observation that the sway is learned from [s]."""
 SWAY_EVERY = 6
 """So many fits of the heave to one of the sway, north and then east."""
-SWAY_LOWEST_HZ = 0.07
-"""Motion slower than this is the place's drift, and no sway."""
+SLOW_S = 14.0
+"""Means over so long show the drift of the place without its sway [s]."""
+SLOW_SIGMA_S = 4.0
+"""Width of the average that tells slow from fast: a fifth of it is left at the slowest sea's frequency [s]."""
 STILL_M = 0.01
 """Smallest 1-sigma that a platform is believed to move with [m]."""
 SEA_RADPS = (0.44, 5.0)
@@ -58,31 +53,35 @@ SEA_RADPS = (0.44, 5.0)
 class MotionLearner:
     """Collects where each fix shows the deck, and fits a model every ``every_s`` to the last ``window_s``.
 
-    The times of the fits are whole multiples of ``every_s`` of the inertial clock. ``parameters`` (11,) are the prior's
-    at first, and then what was learned (``estimation.deck``).
+    The times of the fits are whole multiples of ``every_s`` of the inertial clock. ``parameters`` (22,) are the prior's
+    at first, and then what was learned (``estimation.deck``); ``blocks`` are the chains whose form was, by their first
+    place in them.
     """
 
     every_s: float
     window_s: float
     parameters: Array
     model: HeaveModel | None = None
-    block: BandPass | None = None
+    blocks: dict[int, BandPass] = field(default_factory=dict)
     sway: list[HeaveModel | None] = field(default_factory=lambda: [None, None])
     _t_ns: list[int] = field(default_factory=list)
     _seen: list[list[float]] = field(default_factory=list)
     _due_ns: int | None = None
     _settled_ns: int = 0
     _begin_ns: int | None = None
+    _walks: list[float] = field(default_factory=lambda: [0.0, 0.0])
     _count: int = 0
+    _changed: set[int] = field(default_factory=set)
     _prior: Array = field(init=False)
 
     def __post_init__(self) -> None:
         """Keep the prior."""
         self._prior = self.parameters.copy()
 
-    def take(self, rows: Rows) -> list[tuple[int, HeaveModel, Array]]:
+    def take(self, rows: Rows) -> list[tuple[int, HeaveModel, dict[int, Array]]]:
         """Take rows that are final, in order; return for each fit that came due its time, the heave's model and the
-        parameters from then on.
+        chains that change: by their first place in ``parameters``, their parameters from then on (7,) with the place's
+        random walk behind them (8,).
         """
         every = int(self.every_s * 1e9)
         seen = (rows.kind == Kind.VISION) & (rows.outcome <= Outcome.DOWNWEIGHTED) & (rows.seen[:, 1] > 0.0)
@@ -100,7 +99,16 @@ class MotionLearner:
             at = stop
             model = self._fit()
             if model is not None:
-                results.append((self._due_ns, model, self.parameters.copy()))
+                walk = self.parameters[OFFSET_WALK]
+                changed = sorted({HEAVE, *self._changed})
+                results.append(
+                    (
+                        self._due_ns,
+                        model,
+                        {c: np.array([*self.parameters[c : c + BAND_PARAMETERS], walk]) for c in changed},
+                    )
+                )
+                self._changed.clear()
             self._due_ns += every
         self._keep(waiting.take(slice(at, len(waiting))))
         return results
@@ -108,13 +116,14 @@ class MotionLearner:
     def _keep(self, rows: Rows) -> None:
         for i in np.flatnonzero(rows.reset == LET_GO):
             self._begin_ns = int(rows.t_ns[i]) - int(BEFORE_S * 1e9)
-            self.model = self.block = None
-            self.parameters[:HEAVE_PARAMETERS] = self._prior[:HEAVE_PARAMETERS]
+            self.model = None
+            self.blocks.pop(HEAVE, None)
+            self.parameters[:BAND_PARAMETERS] = self._prior[:BAND_PARAMETERS]
         for t_ns, seen in zip(rows.t_ns.tolist(), rows.seen.tolist(), strict=True):
             if not self._t_ns or t_ns - self._t_ns[-1] > GAP_S * 1e9:
                 self._settled_ns = t_ns + int(SETTLING_S * 1e9)
             self._t_ns.append(t_ns)
-            self._seen.append(seen if t_ns >= self._settled_ns else [*seen[:6], math.nan])
+            self._seen.append(seen if t_ns >= self._settled_ns else [*seen[:6], math.nan, *seen[7:]])
 
     def _drift(self, level: Array) -> Array:
         """Return how far the level (n,) was, at each fix, from what it is at the last; before it had settled (NaN) as
@@ -141,77 +150,89 @@ class MotionLearner:
         now = slice(0 if self._begin_ns is None else int(np.searchsorted(self._t_ns, self._begin_ns)), None)
         if len(t[now]) < 2 or t[-1] - t[now][0] < LEAST_S:
             return None
-        height = seen[now, 0] - self._drift(seen[now, 6])
+        level = self._drift(seen[now, 6])
+        height = seen[now, 0] - level + fast_part(t[now], level + seen[now, 9])
         sigma = np.sqrt(seen[now, 1])
         self.model = fit(t[now], height, sigma, window_s=self.window_s, previous=self.model)
         if self.model.method == "bhr":
-            self._take_heave(self.model)
+            self._take(HEAVE, self.model)
         if t[-1] - t[0] >= SWAY_S:
             axis = self._count % SWAY_EVERY
             if axis < len(self.sway):
                 place, sigma = seen[:, 2 + 2 * axis], np.sqrt(seen[:, 3 + 2 * axis])
-                self.sway[axis] = fit(t, place, sigma, window_s=self.window_s, previous=self.sway[axis])
-                self._take_sway()
+                inertial = place - fast_part(t, seen[:, 7 + axis])
+                model = fit(t, inertial, sigma, window_s=self.window_s, previous=self.sway[axis])
+                self.sway[axis] = model
+                if model.learned is not None:
+                    self._take(CHAINS[1 + axis], model)
+                self._walks[axis] = _walk(t, place)
+                self.parameters[OFFSET_WALK] = max(float(self._prior[OFFSET_WALK]), *self._walks)
             self._count += 1
         return self.model
 
-    def _take_heave(self, model: HeaveModel) -> None:
-        sea = float(model.power_m2[2.0 * math.pi * model.frequency_hz >= SEA_RADPS[0]].sum())
+    def _take(self, chain: int, model: HeaveModel) -> None:
+        """Take a chain's form from a model where the model foresees the motion, else its size and speed."""
+        omega, power = 2.0 * math.pi * model.frequency_hz, model.power_m2
+        fast = omega >= SEA_RADPS[0]
+        share = float(power[fast].sum()) / max(float(power.sum()), 1e-12)
         known = model.sd_m >= STILL_M and float(model.skill(0.5)) >= LEAST_SKILL
-        if known and sea >= LEAST_SEA * float(model.power_m2.sum()):
-            self.block = model.band_pass(previous=self.block)
-            self.parameters[:HEAVE_PARAMETERS] = self.block.parameters
+        # Slow motion of the place is its drift, or that of the vehicle's own, and no sway.
+        known = known and (share >= LEAST_SEA if chain == HEAVE else share * model.sd_m**2 >= STILL_M**2)
+        if known:
+            lowest_hz = 0.0 if chain == HEAVE else SEA_RADPS[0] / (2.0 * math.pi)
+            block = model.band_pass(previous=self.blocks.get(chain), lowest_hz=lowest_hz)
+            self.blocks[chain] = block
+            self._put(chain, block.parameters)
             return
-        self.block = None
+        self.blocks.pop(chain, None)
         # A sea of less than the noise's density may be there unseen: it adds to size and speed.
         hidden, top = HIDDEN * model.noise_density_m2ps, SEA_RADPS[1] / (2.0 * math.pi)
-        size = math.sqrt(model.sd_m**2 + hidden * top)
-        rate = math.sqrt(model.coefficients.rate_variance_m2ps2 + hidden * SEA_RADPS[1] ** 2 * top / 3.0)
-        self.parameters[:HEAVE_PARAMETERS] = broad_heave(size, rate, float(self._prior[4]))
+        rate_share = float((power * omega**2)[fast].sum()) / max(float(power @ omega**2), 1e-12)
+        if chain == HEAVE:
+            share = rate_share = 1.0
+        size = math.sqrt(share * model.sd_m**2 + hidden * top)
+        speed = rate_share * model.coefficients.rate_variance_m2ps2
+        rate = math.sqrt(speed + hidden * SEA_RADPS[1] ** 2 * top / 3.0)
+        self._put(chain, broad_motion(size, rate, float(self._prior[chain + 4])))
 
-    def _take_sway(self) -> None:
-        """Take size, speed and drift from the models of north and east that there are."""
-        known = [m for m in self.sway if m is not None and m.learned is not None]
-        fast = slow = 0.0
-        walk = float(self._prior[OFFSET_WALK]) ** 2
-        for axis, model in enumerate(self.sway):
-            if model is None or model.learned is None:
-                continue
-            omega, power = 2.0 * math.pi * model.frequency_hz, model.power_m2
-            high = model.frequency_hz >= SWAY_LOWEST_HZ
-            self.parameters[SWAY_NORTH + axis] = max(STILL_M, math.sqrt(float(power[high].sum())))
-            slow += float(power[high].sum())
-            fast += float(power[high] @ omega[high] ** 2)
-            walk = max(walk, _walk(model) ** 2)
-        if known:
-            self.parameters[SWAY_OMEGA] = _in_sea(math.sqrt(fast / max(slow, 1e-12)))
-            self.parameters[OFFSET_WALK] = math.sqrt(walk)
+    def _put(self, chain: int, band: Array) -> None:
+        self.parameters[chain : chain + BAND_PARAMETERS] = band
+        self._changed.add(chain)
 
 
-def broad_heave(sigma_m: float, rate_mps: float, damping: float) -> Array:
-    """Return the heave's parameters (7,) of any sea's form, with this damping, that heaves, and heaves at a rate, with
-    these standard deviations (the rate within what seas have).
+def fast_part(t_s: Array, y: Array) -> Array:
+    """Return y (n,) less its slow part: the line through its neighbours, weighted by a Gaussian of ``SLOW_SIGMA_S``.
+
+    Measurements move the vehicle, and what it sees with it, in steps that look like a short sea. Added to a series of
+    what was seen, the fast part of how far they moved it leaves above the cut-off what inertia alone would have shown.
     """
-    unit = np.array([1.0, *ANY_SEA, damping, damping, damping])
-    stationary, row = heave_stationary(unit), heave_matrix(unit)[5]
+    grid = np.arange(t_s[0], t_s[-1] + 1.0, 1.0)
+    away = t_s - grid[:, None]
+    w = np.exp(-0.5 * (away / SLOW_SIGMA_S) ** 2)
+    w0, w1, w2 = w.sum(axis=1), (w * away).sum(axis=1), (w * away**2).sum(axis=1)
+    y0, y1 = w @ y, (w * away) @ y
+    return np.asarray(y - np.interp(t_s, grid, (w2 * y0 - w1 * y1) / (w0 * w2 - w1**2)))
+
+
+def broad_motion(sigma_m: float, rate_mps: float, damping: float) -> Array:
+    """Return a chain's parameters (7,) of any sea's form, with this damping, whose displacement and rate have these
+    standard deviations (the rate within what seas have).
+    """
+    unit = any_sea(1.0, 1.0, damping)
+    stationary, row = band_stationary(unit), band_matrix(unit)[5]
     per_omega = math.sqrt(float(row @ stationary @ row / stationary[5, 5]))
     sigma = max(sigma_m, STILL_M)
-    omega = _in_sea(rate_mps / (sigma * per_omega))
-    unit[1:4] *= omega
-    unit[0] = sigma / math.sqrt(heave_stationary(unit)[5, 5])
-    return unit
+    omega = rate_mps / (sigma * per_omega)
+    return any_sea(sigma, min(max(omega, SEA_RADPS[0]), SEA_RADPS[1]), damping)
 
 
-def _walk(model: HeaveModel) -> float:
-    """Return the random walk [m/rts] that stands for the motion seen at periods longer than a sway's."""
-    assert model.learned is not None
-    basis, mean = model.coefficients.basis, model.coefficients.mean.copy()
-    fast = np.flatnonzero(model.frequency_hz >= SWAY_LOWEST_HZ)
-    mean[fast] = mean[len(model.frequency_hz) + fast] = 0.0
-    time = np.linspace(-model.span_s, 0.0, max(16, int(model.span_s)))
-    velocity = basis.rates(time) @ mean
+def _walk(t_s: Array, place_m: Array) -> float:
+    """Return the random walk [m/rts] that stands for how the place (n,) drifts from one mean to the next."""
+    block = np.floor((t_s - t_s[-1]) / SLOW_S).astype(int)
+    means = [
+        float(place_m[block == k].mean()) for k in np.unique(block) if np.ptp(t_s[block == k]) > 0.8 * SLOW_S
+    ]
+    if len(means) < 2:
+        return 0.0
+    velocity = np.diff(means) / SLOW_S
     return math.sqrt(float(np.mean(velocity**2)) * DRIFT_TIME_S)
-
-
-def _in_sea(omega_radps: float) -> float:
-    return min(max(omega_radps, SEA_RADPS[0]), SEA_RADPS[1])

@@ -78,7 +78,6 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     LATENCY_WALK,
     LATENCY_RATE,
     LATENCY,
-    SWAY_ZETA,
     LEVEL_WALK,
     PRIOR_HEAVE,
     _,
@@ -88,7 +87,7 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     _,
     _,
     SIZE,
-) = range(74)
+) = range(73)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +139,7 @@ def pack_parameters(config: Config, site: Site) -> Array:
     mount = quat_to_matrix(euler_to_quat(*v.mount_rpy_rad))
     p[VISION_MOUNT : VISION_MOUNT + 9] = (R_CB_NOMINAL @ mount.T).ravel()
     p[LATENCY_WALK], p[LATENCY_RATE], p[LATENCY] = v.latency_walk, v.latency_rate_radps, v.latency_s
-    p[SWAY_ZETA], p[LEVEL_WALK] = d.sway_damping, d.level_walk
+    p[LEVEL_WALK] = d.level_walk
     if d.use is True:
         from estimation.deck import prior_motion
 

@@ -38,7 +38,7 @@ def moved_far(kind: int, error: Array, offsets: Offsets) -> bool:
     down = error[offsets[POSITION] + 2] + error[offsets[PLATFORM_LEVEL]] + error[offsets[PLATFORM_HEAVE] + 5]
     square = down * down
     for axis in range(2):
-        place = error[offsets[PLATFORM_OFFSET] + axis] + error[offsets[PLATFORM_SWAY] + 2 * axis]
+        place = error[offsets[PLATFORM_OFFSET] + axis] + error[offsets[PLATFORM_SWAY] + 6 * axis + 5]
         square += (error[offsets[POSITION] + axis] - place) ** 2
     return bool(math.sqrt(square) > FAR_M)
 

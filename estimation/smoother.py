@@ -173,11 +173,11 @@ def _run(
     trail = Trail.empty(last - first - imu + _periods(rows, first, last, state, period_ns) + 2, layout.size)
     trail.chain[0] = np.eye(layout.size)
     s = engine.state
-    trail.open(int(s.clock[0]), s.x, s.P, s.heave)
+    trail.open(int(s.clock[0]), s.x, s.P, s.motion)
     engine.trail = trail
     engine.advance(rows, first, last, Estimates.empty(imu, layout), EVER, period_ns)
     s = engine.state
-    trail.reach(int(s.clock[0]), s.x, s.P, s.heave)
+    trail.reach(int(s.clock[0]), s.x, s.P, s.motion)
     return trail
 
 
@@ -205,17 +205,17 @@ def _backwards(later: Smoothed | None, trail: Trail, layout: Layout, p: Array) -
         # Else the piece's last node, which is the first of the piece behind: the same instant.
         if trail.marks[k, EMITS]:
             place -= 1
-            _write(out, place, int(trail.t_ns[k]), later, trail.heave[k], layout)
+            _write(out, place, int(trail.t_ns[k]), later, trail.motion[k], layout)
     assert later is not None
     return later, out
 
 
-def _write(out: Estimates, k: int, t_ns: int, s: Smoothed, heave: Array, layout: Layout) -> None:
+def _write(out: Estimates, k: int, t_ns: int, s: Smoothed, motion: Array, layout: Layout) -> None:
     out.t_ns[k] = t_ns
     out.x[k] = s.x
     out.sigma[k] = np.sqrt(np.maximum(np.diag(s.P), 0.0))
     out.covariance[k] = s.P[:9, :9]
     if out.deck.shape[1]:
-        out.deck[k], A = deck_output(s.x, heave, layout.offsets, layout.size)
+        out.deck[k], A = deck_output(s.x, motion, layout.offsets, layout.size)
         out.deck_covariance[k] = A @ s.P @ A.T
-        add_drift(heave, out.deck_covariance[k])
+        add_drift(motion, out.deck_covariance[k])

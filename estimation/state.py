@@ -46,7 +46,14 @@ BLOCKS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("gps_bias", ("n", "e", "d"), "m"),
     ("baro_bias", ("h",), "m"),
     ("platform_offset", ("n", "e"), "m"),
-    ("platform_sway", ("n", "n_rate", "e", "e_rate"), "m"),
+    (
+        "platform_sway",
+        (
+            *("n1", "n1_rate", "n2", "n2_rate", "n3", "n3_rate"),
+            *("e1", "e1_rate", "e2", "e2_rate", "e3", "e3_rate"),
+        ),
+        "m",
+    ),
     ("platform_level", ("h",), "m"),
     ("platform_heave", ("1", "1_rate", "2", "2_rate", "3", "3_rate"), "m"),
     ("range_scale", ("s",), "-"),
@@ -114,7 +121,7 @@ class Layout:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the error state's entries; rates of an oscillator carry ``/s``."""
+        """Units of the error state's entries; rates of a chain's sections carry ``/s``."""
         return tuple(
             BLOCKS[b][2] + ("/s" if c.endswith("_rate") else "")
             for b in range(len(SIZES))

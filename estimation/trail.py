@@ -29,7 +29,7 @@ class Trail:
 
     ``t_ns`` (m,); ``marks`` (m, 3); ``nominal`` (m, 2, NOMINAL_SIZE) and ``covariance`` (m, 2, n, n) before and after
     the node's measurements; ``chain`` (m + 1, n, n) the error state's transition from the node before to this one
-    (that behind the last node is still growing); ``heave`` (m, 11) the deck's parameters. A node at which the filter
+    (that behind the last node is still growing); ``motion`` (m, 22) the deck's parameters. A node at which the filter
     was moved onto a sensor has the state after that move in both places: the move belongs to the transition.
     """
 
@@ -39,7 +39,7 @@ class Trail:
     nominal: Array
     covariance: Array
     chain: Array
-    heave: Array
+    motion: Array
 
     @classmethod
     def empty(cls, m: int, n: int) -> Trail:
@@ -64,22 +64,22 @@ class Trail:
         """Whether there is room to record."""
         return len(self.t_ns) > 0
 
-    def open(self, t_ns: int, x: Array, P: Array, heave: Array) -> None:
+    def open(self, t_ns: int, x: Array, P: Array, motion: Array) -> None:
         """Begin a node, with the state before its measurements, which is the state after them so far."""
         k = int(self.count[0])
         self.t_ns[k] = t_ns
         self.marks[k] = 0
         self.nominal[k] = x
         self.covariance[k] = P
-        self.heave[k] = heave
+        self.motion[k] = motion
         self.chain[k + 1] = np.eye(len(P))
         self.count[0] = k + 1
 
-    def reach(self, t_ns: int, x: Array, P: Array, heave: Array) -> None:
+    def reach(self, t_ns: int, x: Array, P: Array, motion: Array) -> None:
         """Begin a node unless the last one is at this instant."""
         k = int(self.count[0])
         if k == 0 or self.t_ns[k - 1] != t_ns:
-            self.open(t_ns, x, P, heave)
+            self.open(t_ns, x, P, motion)
 
     def close(self, x: Array, P: Array) -> None:
         """Note what the last node's measurements have left."""

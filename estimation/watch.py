@@ -15,14 +15,8 @@ import math
 import numpy as np
 
 from estimation import parameters as par
-from estimation.deck import (
-    HEAVE_PARAMETERS,
-    HEAVE_SIZE,
-    camera_to_ned,
-    change_motion,
-    heave_moments,
-    heave_states,
-)
+from estimation.band import BAND_PARAMETERS, BAND_SIZE, band_moments, band_states
+from estimation.deck import HEAVE, camera_to_ned, change_motion
 from estimation.frames import Array
 from estimation.state import PLATFORM_HEAVE, Offsets
 
@@ -41,7 +35,7 @@ LET_GO = 2
 
 
 def unexplained(
-    memory: Array, t_s: float, r: Array, S: Array, weight: float, x: Array, p: Array, heave: Array
+    memory: Array, t_s: float, r: Array, S: Array, weight: float, x: Array, p: Array, motion: Array
 ) -> bool:
     """Take a fix's innovation r (3,) with its covariance S (3, 3); return whether the learned heave is to be let go.
 
@@ -72,13 +66,15 @@ def unexplained(
     if mean <= UNEXPLAINED_SIGMA * math.sqrt(memory[8]):
         return False
     any_sea = True
-    for k in range(HEAVE_PARAMETERS):
-        any_sea = any_sea and heave[k] == p[par.PRIOR_HEAVE + k]
-    return not any_sea and mean * sigma > UNEXPLAINED_SHARE * math.sqrt(heave_moments(heave)[3])
+    for k in range(BAND_PARAMETERS):
+        any_sea = any_sea and motion[k] == p[par.PRIOR_HEAVE + k]
+    return not any_sea and mean * sigma > UNEXPLAINED_SHARE * math.sqrt(
+        band_moments(motion[:BAND_PARAMETERS])[3]
+    )
 
 
 def let_go(
-    t_s: float, x: Array, P: Array, memory: Array, scatter: Array, heave: Array, p: Array, offsets: Offsets,
+    t_s: float, x: Array, P: Array, memory: Array, scatter: Array, motion: Array, p: Array, offsets: Offsets,
     chain: Array,
 ) -> None:  # fmt: skip
     """Go back to the heave of any sea, in place, and open the heave's states as far as that sea goes.
@@ -86,23 +82,21 @@ def let_go(
     Heave, rate and acceleration keep their values, their doubt grows by that sea's. ``chain`` is as in
     ``change_motion``; ``scatter`` keeps the time, before which nothing that was learned is taken up any more.
     """
-    new = heave.copy()
-    for k in range(HEAVE_PARAMETERS):
-        new[k] = p[par.PRIOR_HEAVE + k]
-    change_motion(x, P, heave, new, offsets, chain)
-    m = heave_moments(new)
+    new = p[par.PRIOR_HEAVE : par.PRIOR_HEAVE + BAND_PARAMETERS]
+    change_motion(x, P, motion, HEAVE, new, offsets, chain)
+    m = band_moments(new)
     start = offsets[PLATFORM_HEAVE]
-    T = np.empty((HEAVE_SIZE, HEAVE_SIZE))
-    for c in range(HEAVE_SIZE):
-        unit = np.zeros(HEAVE_SIZE)
+    T = np.empty((BAND_SIZE, BAND_SIZE))
+    for c in range(BAND_SIZE):
+        unit = np.zeros(BAND_SIZE)
         unit[c] = 1.0
-        T[:, c] = heave_states(unit, new)
+        T[:, c] = band_states(unit, new)
     # E[z_i z_j] of z and its derivatives: (-1)^((i - j) / 2) m_((i + j) / 2) for even i + j, else 0.
-    for i in range(HEAVE_SIZE):
+    for i in range(BAND_SIZE):
         for j in range(i + 1):
             spread = 0.0
-            for a in range(HEAVE_SIZE):
-                for b in range(a % 2, HEAVE_SIZE, 2):
+            for a in range(BAND_SIZE):
+                for b in range(a % 2, BAND_SIZE, 2):
                     sign = 1.0 if (a - b) % 4 == 0 else -1.0
                     spread += T[i, a] * sign * m[(a + b) // 2] * T[j, b]
             P[start + i, start + j] += spread

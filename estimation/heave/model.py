@@ -217,12 +217,15 @@ class HeaveModel:
             c, start_s, duration_s, rate_limit_mps, height_band_m, samples, generator
         )
 
-    def band_pass(self, *, blocks: int = 1, previous: BandPass | None = None) -> BandPass:
+    def band_pass(
+        self, *, blocks: int = 1, previous: BandPass | None = None, lowest_hz: float = 0.0
+    ) -> BandPass:
         """State-space block of the learned spectrum with the motion's standard deviation; ``bhr`` only.
 
-        ``blocks`` is 1 for six states, 2 for eight; ``previous`` is where the search begins.
+        ``blocks`` is 1 for six states, 2 for eight; ``previous`` is where the search begins. What is slower than
+        ``lowest_hz`` is left out. Raises ``ValueError`` where there is no motion.
         """
-        density = self.density_m2ps
+        density = np.where(self.frequency_hz >= lowest_hz, self.density_m2ps, 0.0)
         if not np.any(density > 0):
             raise ValueError("there is no motion to fit a block to")
         scale = self.coefficients.variance_m2 / float(self.power_m2.sum())

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 
 from estimation.ahead import DeckForecaster
+from estimation.band import band_matrix, band_stationary
 from estimation.config import parse_config
-from estimation.deck import deck_transition, heave_matrix, heave_stationary
+from estimation.deck import deck_transition
 from estimation.estimator import LandingEstimator
 from estimation.parameters import Site, pack_parameters
 from estimation.state import PH0, PS0, Layout, nominal_zero
 from simulation.flight import load_scenario, simulate
 
 HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4])
-SWAY = np.array([0.2, -0.1, 0.05, 0.3])
+NORTH, EAST = np.array([0.4, 1.1, 1.2, 2.0, 0.1, 0.2, 0.4]), np.array([0.7, 0.9, 1.6, 1.9, 0.2, 0.3, 0.3])
+SWAY = 0.2 * np.random.default_rng(5).normal(size=12)
 
 
 CONFIG = parse_config("[platform]\nuse = true\n")
-SWING = np.array([2.0 * math.pi / CONFIG.platform.sway_period_s, CONFIG.platform.sway_damping])
-MOTION = np.array([*HEAVE, 0.1, 0.1, SWING[0], 0.05])
+MOTION = np.array([*HEAVE, *NORTH, *EAST, 0.05])
 
 
 def some_heave() -> tuple[np.ndarray, np.ndarray]:
@@ -38,28 +39,31 @@ def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
     x6, P = some_heave()
     x, covariance = nominal_zero(), P.copy()
     x[PH0 : PH0 + 6] = x6
-    x[PS0 : PS0 + 4] = SWAY
-    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x6, P, HEAVE, True, SWAY, SWING)
+    x[PS0 : PS0 + 12] = SWAY
+    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x6, P, MOTION, True, SWAY)
     for _ in range(160):
         F, Q = np.eye(layout.size), np.zeros((layout.size, layout.size))
         y = x.copy()
         deck_transition(x, y, 0.005, p, MOTION, layout.offsets, F, Q)
         x = y
         covariance = F[block, block] @ covariance @ F[block, block].T + Q[block, block]
-    rate = heave_matrix(HEAVE)[5]
+    rate = band_matrix(HEAVE)[5]
     assert forecast.height_m == pytest.approx([x6[5], x[PH0 + 5]], abs=1e-6)
     assert forecast.rate_mps == pytest.approx([rate @ x6, rate @ x[PH0 : PH0 + 6]], abs=1e-6)
     assert forecast.rate_sigma_mps[1] == pytest.approx(math.sqrt(rate @ covariance @ rate), rel=1e-3)
-    assert forecast.sway_mps[0] == pytest.approx(SWAY[[1, 3]])
-    assert forecast.sway_mps[1] == pytest.approx([x[PS0 + 1], x[PS0 + 3]], abs=1e-6)
+    for axis, band in enumerate((NORTH, EAST)):
+        swing, at = band_matrix(band)[5], PS0 + 6 * axis
+        assert forecast.sway_mps[:, axis] == pytest.approx(
+            [swing @ SWAY[6 * axis : 6 * axis + 6], swing @ x[at : at + 6]], abs=1e-6
+        )
     assert forecast.height_sigma_m[1] == pytest.approx(math.sqrt(covariance[5, 5]), rel=1e-3)
 
 
 def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
     x6, P = some_heave()
-    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x6, 1e3 * P, HEAVE, False, SWAY, SWING)
-    sea = heave_stationary(HEAVE)
-    rate = heave_matrix(HEAVE)[5]
+    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x6, 1e3 * P, MOTION, False, SWAY)
+    sea = band_stationary(HEAVE)
+    rate = band_matrix(HEAVE)[5]
     assert forecast.sea_rate_sigma_mps == pytest.approx(math.sqrt(rate @ sea @ rate))
     assert np.all(forecast.rate_sigma_mps <= forecast.sea_rate_sigma_mps * (1.0 + 1e-12))
     assert np.all((forecast.skill >= 0.0) & (forecast.skill <= 1.0))
@@ -69,7 +73,7 @@ def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
 
 def test_the_probability_of_quiet_is_that_of_the_worst_moment() -> None:
     x6, P = some_heave()
-    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x6, P, HEAVE, True, SWAY, SWING)
+    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x6, P, MOTION, True, SWAY)
     chance = forecast.quiet_probability(0.5, 1.5, 0.3)
     rng = np.random.default_rng(1)
     inside = (forecast.horizon_s >= 0.5) & (forecast.horizon_s <= 1.5)

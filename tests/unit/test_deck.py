@@ -11,18 +11,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from estimation.band import band_derivatives, band_matrix, band_moments, band_states, band_stationary
 from estimation.config import parse_config
 from estimation.deck import (
-    SWAY_NORTH,
-    SWAY_OMEGA,
+    CHAINS,
+    HEAVE,
     change_motion,
     deck_output,
     deck_transition,
-    heave_derivatives,
-    heave_matrix,
-    heave_moments,
-    heave_states,
-    heave_stationary,
+    places,
     seen_place,
     vision,
 )
@@ -50,7 +47,14 @@ CONFIG = parse_config(
 )
 LAYOUT = Layout.of(CONFIG)
 P = pack_parameters(CONFIG, Site((0.9, 0.1, 50.0), 0.0))
-HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4, 0.1, 0.2, 1.1, 0.05])
+MOTION = np.array(
+    [
+        *(0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4),
+        *(0.2, 0.8, 1.1, 1.4, 0.2, 0.3, 0.6),
+        *(0.3, 0.6, 1.2, 2.4, 0.1, 0.4, 0.5),
+        0.05,
+    ]
+)
 GYRO = np.array([0.2, -0.3, 0.1])
 Array = NDArray[np.float64]
 
@@ -62,7 +66,7 @@ def some_state(seed: int = 1) -> Array:
     x[V0 : V0 + 3] = rng.normal(size=3)
     x[Q0 : Q0 + 4] = euler_to_quat(0.2, -0.15, 1.1)
     x[PO0 : PO0 + 2] = [4.0, -3.0]
-    x[PS0 : PS0 + 4] = rng.normal(size=4) * 0.1
+    x[PS0 : PS0 + 12] = rng.normal(size=12) * 0.1
     x[PL0] = 0.3
     x[PH0 : PH0 + 6] = rng.normal(size=6) * 0.3
     x[RS0], x[CL0] = 0.01, 0.02
@@ -109,49 +113,39 @@ def test_the_jacobian_of_a_fix_is_its_derivative() -> None:
     assert H[:, rest] == pytest.approx(numeric[:, rest], abs=1e-6)
 
 
-def test_the_transition_is_the_exponential_of_the_oscillators() -> None:
+@pytest.mark.parametrize("chain", CHAINS)
+def test_the_transition_is_the_exponential_of_the_chain(chain: int) -> None:
     x, y, dt = some_state(), some_state(), 0.02
     F, Q = np.eye(LAYOUT.size), np.zeros((LAYOUT.size, LAYOUT.size))
-    deck_transition(x, y, dt, P, HEAVE, LAYOUT.offsets, F, Q)
-    start = LAYOUT.names.index("platform_heave.1")
-    block = slice(start, start + 6)
-    f, drive = heave_matrix(HEAVE), np.zeros((6, 1))
-    drive[1] = HEAVE[0]
+    deck_transition(x, y, dt, P, MOTION, LAYOUT.offsets, F, Q)
+    at, start = places(chain, LAYOUT.offsets)
+    block, band = slice(start, start + 6), MOTION[chain : chain + 7]
+    f, drive = band_matrix(band), np.zeros((6, 1))
+    drive[1] = band[0]
     exact = expm(f * dt)
-    assert F[block, block] == pytest.approx(exact, abs=2e-7)
-    assert y[PH0 : PH0 + 6] == pytest.approx(exact @ x[PH0 : PH0 + 6], abs=1e-7)
+    assert F[block, block] == pytest.approx(exact, abs=1e-6)
+    assert y[at : at + 6] == pytest.approx(exact @ x[at : at + 6], abs=1e-6)
     big = np.block([[-f, drive @ drive.T], [np.zeros((6, 6)), f.T]])
     turned = expm(big * dt)
     noise = turned[6:, 6:].T @ turned[:6, 6:]
     assert Q[block, block] == pytest.approx(noise, rel=1e-2, abs=1e-8)
     assert np.linalg.eigvalsh(Q).min() > -1e-15
-
-
-def test_the_stationary_covariance_stays_as_it_is() -> None:
-    stationary, dt = heave_stationary(HEAVE), 0.02
-    F, Q = np.eye(LAYOUT.size), np.zeros((LAYOUT.size, LAYOUT.size))
-    x = some_state()
-    deck_transition(x, x.copy(), dt, P, HEAVE, LAYOUT.offsets, F, Q)
-    start = LAYOUT.names.index("platform_heave.1")
-    block = slice(start, start + 6)
-    sway = slice(LAYOUT.names.index("platform_sway.n"), LAYOUT.names.index("platform_sway.n") + 2)
+    stationary = band_stationary(band)
     after = F[block, block] @ stationary @ F[block, block].T + Q[block, block]
     assert after == pytest.approx(stationary, abs=1e-4 * stationary.max())
-    s = HEAVE[SWAY_NORTH] ** 2 * np.diag([1.0, HEAVE[SWAY_OMEGA] ** 2])
-    assert F[sway, sway] @ s @ F[sway, sway].T + Q[sway, sway] == pytest.approx(s, abs=1e-5)
 
 
 def test_what_is_reported_is_the_difference_and_its_jacobian() -> None:
     x, step = some_state(), 1e-6
-    y, A = deck_output(x, HEAVE, LAYOUT.offsets, LAYOUT.size)
+    y, A = deck_output(x, MOTION, LAYOUT.offsets, LAYOUT.size)
     height = x[PL0] + x[PH0 + 5]
     assert y[6] == pytest.approx(height)
     assert y[2] == pytest.approx(x[P0 + 2] + height)
-    assert y[7] == pytest.approx(heave_matrix(HEAVE)[5] @ x[PH0 : PH0 + 6])
+    assert y[7] == pytest.approx(band_matrix(MOTION[:7])[5] @ x[PH0 : PH0 + 6])
     for k in range(LAYOUT.size):
         d = np.zeros(LAYOUT.size)
         d[k] = step
-        change = deck_output(plus(x, d, LAYOUT.offsets), HEAVE, LAYOUT.offsets, LAYOUT.size)[0] - y
+        change = deck_output(plus(x, d, LAYOUT.offsets), MOTION, LAYOUT.offsets, LAYOUT.size)[0] - y
         assert change / step == pytest.approx(A[:, k], abs=1e-6)
 
 
@@ -168,67 +162,71 @@ def test_a_fix_that_is_too_short_shows_a_higher_deck_and_one_aside_another_place
     )
 
 
-def motion(rng: np.random.Generator) -> Array:
-    """Return parameters of some motion (11,): heave sections of 1 to 14 s and of every damping."""
+def band(rng: np.random.Generator) -> Array:
+    """Return the parameters of some chain (7,): sections of 1 to 14 s and of every damping."""
     return np.array(
-        [rng.uniform(0.05, 2.0), *rng.uniform(0.44, 6.0, 3), *np.exp(rng.uniform(np.log(0.02), 0.7, 3)),
-         0.1, 0.2, 1.1, 0.05]
-    )  # fmt: skip
+        [rng.uniform(0.05, 2.0), *rng.uniform(0.44, 6.0, 3), *np.exp(rng.uniform(np.log(0.02), 0.7, 3))]
+    )
+
+
+def moving(chain: int, one: Array) -> Array:
+    """Return a platform's motion with these parameters of one chain."""
+    out = MOTION.copy()
+    out[chain : chain + 7] = one
+    return out
 
 
 def shown(heave: Array) -> Array:
     """Return the rows (3, 6) that take the chain's states to heave, rate and acceleration."""
-    f, unit = heave_matrix(heave), np.eye(6)[5]
+    f, unit = band_matrix(heave), np.eye(6)[5]
     return np.stack([unit, unit @ f, unit @ f @ f])
 
 
 @given(st.integers(0, 2**32 - 1))
 def test_the_heaves_derivatives_are_another_form_of_its_states(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    heave, x = motion(rng), rng.normal(size=6)
-    z = heave_derivatives(x, heave)
-    assert heave_states(z, heave) == pytest.approx(x, abs=1e-9)
+    heave, x = band(rng), rng.normal(size=6)
+    z = band_derivatives(x, heave)
+    assert band_states(z, heave) == pytest.approx(x, abs=1e-9)
     assert shown(heave) @ x == pytest.approx(z[3:], rel=1e-9, abs=1e-9)
-    to = np.column_stack([heave_derivatives(unit, heave) for unit in np.eye(6)])
-    assert np.diag(to @ heave_stationary(heave) @ to.T) == pytest.approx(heave_moments(heave), rel=1e-6)
+    to = np.column_stack([band_derivatives(unit, heave) for unit in np.eye(6)])
+    assert np.diag(to @ band_stationary(heave) @ to.T) == pytest.approx(band_moments(heave), rel=1e-6)
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_a_new_model_leaves_heave_rate_and_acceleration_what_they_are(seed: int) -> None:
+@given(st.integers(0, 2**32 - 1), st.sampled_from(CHAINS))
+def test_a_new_model_leaves_displacement_rate_and_acceleration_what_they_are(seed: int, chain: int) -> None:
     """With all that is known of them, of anything else, and of the two together; and P stays a covariance."""
     rng = np.random.default_rng(seed)
-    old, new = motion(rng), motion(rng)
-    n, start = LAYOUT.size, LAYOUT.offsets[PLATFORM_HEAVE]
+    old, new = band(rng), band(rng)
+    n, (at, start) = LAYOUT.size, places(chain, LAYOUT.offsets)
     block, x = slice(start, start + 6), nominal_zero()
-    x[PH0 : PH0 + 6] = rng.normal(size=6)
+    x[at : at + 6] = rng.normal(size=6)
     A = rng.normal(size=(n, n))
     P, before = A @ A.T, x.copy()
-    was, heave = P.copy(), old.copy()
-    chain = np.eye(n)
-    change_motion(x, P, heave, new, LAYOUT.offsets, chain)
-    assert np.array_equal(heave, new)
-    assert chain @ was @ chain.T == pytest.approx(P, rel=1e-6, abs=1e-6 * np.abs(P).max())
-    assert shown(new) @ x[PH0 : PH0 + 6] == pytest.approx(
-        shown(old) @ before[PH0 : PH0 + 6], rel=1e-9, abs=1e-8
-    )
+    was, motion = P.copy(), moving(chain, old)
+    trail = np.eye(n)
+    change_motion(x, P, motion, chain, new, LAYOUT.offsets, trail)
+    assert np.array_equal(motion, moving(chain, new))
+    assert trail @ was @ trail.T == pytest.approx(P, rel=1e-6, abs=1e-6 * np.abs(P).max())
+    assert shown(new) @ x[at : at + 6] == pytest.approx(shown(old) @ before[at : at + 6], rel=1e-9, abs=1e-8)
     rest = np.vstack([np.delete(np.eye(n), block, axis=0), np.zeros((3, n))])
     C, D = rest.copy(), rest.copy()
     C[-3:, block], D[-3:, block] = shown(old), shown(new)
     kept = C @ was @ C.T
     assert pytest.approx(kept, rel=1e-6, abs=1e-6 * np.abs(kept).max()) == D @ P @ D.T
     assert np.linalg.eigvalsh(P)[0] > -1e-12 * np.trace(P)
-    assert np.array_equal(np.delete(x, range(PH0, PH0 + 6)), np.delete(before, range(PH0, PH0 + 6)))
+    assert np.array_equal(np.delete(x, range(at, at + 6)), np.delete(before, range(at, at + 6)))
 
 
 @given(st.integers(0, 2**32 - 1))
 def test_the_same_model_taken_up_again_changes_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    heave, x = motion(rng), nominal_zero()
+    one, x = band(rng), nominal_zero()
     x[PH0 : PH0 + 6] = rng.normal(size=6)
     A = rng.normal(size=(LAYOUT.size, LAYOUT.size))
     P, before = A @ A.T, x.copy()
     was = P.copy()
-    change_motion(x, P, heave, heave.copy(), LAYOUT.offsets, np.empty((0, 0)))
+    change_motion(x, P, moving(HEAVE, one), HEAVE, one, LAYOUT.offsets, np.empty((0, 0)))
     assert x == pytest.approx(before, abs=1e-9)
     assert pytest.approx(was, abs=1e-8) == P
 
@@ -237,13 +235,13 @@ def test_the_same_model_taken_up_again_changes_nothing(seed: int) -> None:
 def test_a_sea_of_which_only_the_heave_is_known_becomes_the_new_one(seed: int) -> None:
     """What the old sea leaves open of the integrals, once the heave is known, the new one leaves open too."""
     rng = np.random.default_rng(seed)
-    old, new = motion(rng), motion(rng)
+    old, new = band(rng), band(rng)
     P, x, start = np.zeros((LAYOUT.size, LAYOUT.size)), nominal_zero(), LAYOUT.offsets[PLATFORM_HEAVE]
     block = slice(start, start + 6)
-    P[block, block] = heave_stationary(old)
-    change_motion(x, P, old.copy(), new, LAYOUT.offsets, np.empty((0, 0)))
-    S, C = heave_stationary(new), shown(new)
+    P[block, block] = band_stationary(old)
+    change_motion(x, P, moving(HEAVE, old), HEAVE, new, LAYOUT.offsets, np.empty((0, 0)))
+    S, C = band_stationary(new), shown(new)
     G = S @ C.T @ np.linalg.inv(C @ S @ C.T)
-    y = shown(old) @ heave_stationary(old) @ shown(old).T
+    y = shown(old) @ band_stationary(old) @ shown(old).T
     wanted = G @ y @ G.T + S - G @ C @ S
     assert P[block, block] == pytest.approx(wanted, rel=1e-3, abs=1e-5 * np.abs(wanted).max())

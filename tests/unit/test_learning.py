@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from estimation.band import band_moments
 from estimation.config import PlatformConfig
-from estimation.deck import SWAY_EAST, SWAY_NORTH, SWAY_OMEGA, heave_moments, prior_motion
+from estimation.deck import DRIFT_TIME_S, HEAVE, OFFSET_WALK, SWAY_EAST, SWAY_NORTH, prior_motion
 from estimation.events import Kind
 from estimation.learning import MotionLearner
 from estimation.outcome import Outcome
@@ -35,9 +36,9 @@ def learner() -> MotionLearner:
     return MotionLearner(2.0, 60.0, prior_motion(PlatformConfig()))
 
 
-def told(parameters: Array) -> tuple[float, float]:
-    """Return the 1-sigma of the heave and of its rate that parameters mean."""
-    moments = heave_moments(parameters[:7])
+def told(parameters: Array, chain: int = HEAVE) -> tuple[float, float]:
+    """Return the 1-sigma of a chain's displacement and of its rate that parameters mean."""
+    moments = band_moments(parameters[chain : chain + 7])
     return math.sqrt(moments[3]), math.sqrt(moments[4])
 
 
@@ -55,11 +56,40 @@ def test_a_sea_is_taken_up_in_its_form_and_both_axes_of_the_sway_soon() -> None:
     one = learner()
     one.take(seen(sea(t, 0.2, 5.0, rng), sea(t, 0.15, 5.0, rng), sea(t, 0.02, 5.0, rng), rng))
     size, rate = told(one.parameters)
-    assert one.block is not None
+    assert HEAVE in one.blocks
     assert size == pytest.approx(0.2, rel=0.5) and rate / size == pytest.approx(2.0 * math.pi / 5.0, rel=0.3)
     assert all(m is not None for m in one.sway)
-    assert one.parameters[SWAY_NORTH] > 2.0 * one.parameters[SWAY_EAST]
-    assert one.parameters[SWAY_OMEGA] == pytest.approx(2.0 * math.pi / 5.0, rel=0.5)
+    north, east = told(one.parameters, SWAY_NORTH), told(one.parameters, SWAY_EAST)
+    assert north[0] == pytest.approx(0.15, rel=0.5) and north[0] > 2.0 * east[0]
+    assert north[1] / north[0] == pytest.approx(2.0 * math.pi / 5.0, rel=0.3)
+
+
+def test_steps_of_the_vehicles_own_place_are_no_sea_and_its_drift_is_none_of_the_decks() -> None:
+    """The vehicle is moved by 2 cm at each reading of GPS, back and forth about a slow error of half a metre."""
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 58.0, 1.0 / RATE_HZ)
+    pull = np.repeat(rng.normal(size=len(t) // 3 + 1), 3)[: len(t)] * 0.02
+    moved = np.cumsum(np.where(np.arange(len(t)) % 3 == 0, pull, 0.0))
+    moved += 0.5 * np.sin(2.0 * np.pi * t / 120.0) - np.linspace(0.0, moved[-1], len(t))
+    swing, still = sea(t, 0.1, 6.0, rng), 0.0 * t
+    rows = seen(still - moved, swing + moved, still + moved, rng)
+    rows.seen[:, 7], rows.seen[:, 8], rows.seen[:, 9] = moved, moved, moved
+    one = learner()
+    one.take(rows)
+    size, rate = told(one.parameters, SWAY_NORTH)
+    assert size == pytest.approx(0.1, rel=0.4) and rate / size == pytest.approx(2.0 * math.pi / 6.0, rel=0.3)
+    # Nothing but what the noise may hide: a rate of 0.055 m/s; steps taken as they look would be three times the size.
+    assert told(one.parameters, SWAY_EAST)[0] < 0.02 and told(one.parameters, SWAY_EAST)[1] < 0.06
+    assert told(one.parameters, HEAVE)[0] < 0.04
+    assert one.parameters[OFFSET_WALK] < 0.06
+
+
+def test_the_drift_of_the_place_is_learned_as_a_random_walk() -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(0.0, 58.0, 1.0 / RATE_HZ)
+    one = learner()
+    one.take(seen(0.0 * t, 0.1 * t, sea(t, 0.2, 6.0, rng), rng))
+    assert one.parameters[OFFSET_WALK] == pytest.approx(0.1 * math.sqrt(DRIFT_TIME_S), rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(4))

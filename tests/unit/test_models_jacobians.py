@@ -65,7 +65,32 @@ use = true
 LAYOUT = Layout.of(CONFIG)
 P = pack_parameters(CONFIG, SITE)
 NO_COVARIANCE = np.full(6, np.nan)
-HEAVE = np.array([0.4, 0.9, 1.3, 1.1, 0.3, 0.4, 0.5, 0.1, 0.2, 0.8, 0.05])
+MOTION = np.array(
+    [
+        0.4,
+        0.9,
+        1.3,
+        1.1,
+        0.3,
+        0.4,
+        0.5,
+        0.3,
+        0.8,
+        1.2,
+        1.4,
+        0.2,
+        0.3,
+        0.4,
+        0.2,
+        0.7,
+        1.0,
+        1.6,
+        0.3,
+        0.5,
+        0.6,
+        0.05,
+    ]
+)
 """Gain, three angular frequencies and three dampings of a heaving deck."""
 
 numbers = st.floats(-1.0, 1.0)
@@ -83,7 +108,7 @@ def state(position: Array, velocity: Array, rotation: Array, biases: Array, leve
     x[BP0 : BP0 + 3] = biases
     x[BB0] = biases[0]
     x[PO0 : PO0 + 2] = 2.0 * position[:2]
-    x[PS0 : PS0 + 4] = 0.3 * np.concatenate([velocity, biases[:1]])
+    x[PS0 : PS0 + 12] = 0.3 * np.concatenate([velocity, biases, position, velocity])
     x[PL0] = 0.5 * biases[1]
     x[PH0 : PH0 + 6] = 0.4 * np.concatenate([position, velocity])
     return x
@@ -101,7 +126,7 @@ def test_transition(x: Array, rate: Array, force: Array, dt: float) -> None:
     F, Q, unused = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
 
     def step(start: Array, F: Array = unused, Q: Array = unused) -> Array:
-        return models.transition(start, gyro, accel, dt, scatter, P, LAYOUT.offsets, F, Q, HEAVE)
+        return models.transition(start, gyro, accel, dt, scatter, P, LAYOUT.offsets, F, Q, MOTION)
 
     end = step(x, F, Q)
     numeric = np.empty((n, n))
@@ -130,7 +155,7 @@ def test_process_noise_composes(x: Array, dt: float) -> None:
     parts = []
     for step in (dt, 0.5 * dt):
         F, Q = np.empty((n, n)), np.empty((n, n))
-        models.transition(x, still, still, step, scatter, P, LAYOUT.offsets, F, Q, HEAVE)
+        models.transition(x, still, still, step, scatter, P, LAYOUT.offsets, F, Q, MOTION)
         parts.append((F, Q))
     (_, whole), (F, half) = parts
     sum_of_halves = F @ half @ F.T + half
@@ -227,7 +252,7 @@ def test_magnetometer_noise_does_not_reach_the_tilt() -> None:
 @given(states, vectors, vectors)
 def test_vision(x: Array, gyro: Array, off: Array) -> None:
     """With no mount error and no age: about these the Jacobian is made."""
-    there = np.array([x[PO0] + x[PS0], x[PO0 + 1] + x[PS0 + 2], -x[PL0] - x[PH0 + 5]]) - x[P0 : P0 + 3]
+    there = np.array([x[PO0] + x[PS0 + 5], x[PO0 + 1] + x[PS0 + 11], -x[PL0] - x[PH0 + 5]]) - x[P0 : P0 + 3]
     seen = R_CB_NOMINAL @ (quat_to_matrix(x[Q0 : Q0 + 4]).T @ there)
     measured(models.VISION, six(*(seen + off)), 3.0 * gyro, x)
 
@@ -235,12 +260,12 @@ def test_vision(x: Array, gyro: Array, off: Array) -> None:
 @settings(max_examples=10, deadline=None)
 @given(states)
 def test_what_is_said_of_the_deck(x: Array) -> None:
-    y, A = deck_output(x, HEAVE, LAYOUT.offsets, LAYOUT.size)
+    y, A = deck_output(x, MOTION, LAYOUT.offsets, LAYOUT.size)
     h = 1e-4
     for j in range(LAYOUT.size):
         error = np.zeros(LAYOUT.size)
         error[j] = h
-        moved = deck_output(plus(x, error, LAYOUT.offsets), HEAVE, LAYOUT.offsets, LAYOUT.size)[0]
+        moved = deck_output(plus(x, error, LAYOUT.offsets), MOTION, LAYOUT.offsets, LAYOUT.size)[0]
         np.testing.assert_allclose(A[:, j], (moved - y) / h, atol=1e-8)
 
 

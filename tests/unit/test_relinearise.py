@@ -72,7 +72,7 @@ def test_only_a_fix_that_moves_the_platform_far_is_linearised_again() -> None:
     # Both together: the vehicle is as much lower (down is positive) as the platform is higher.
     error[LAYOUT.names.index("position.d")] = -2.0 * FAR_M
     assert not moved_far(VISION, error, LAYOUT.offsets)
-    error[LAYOUT.names.index("platform_sway.e")] = 2.0 * FAR_M
+    error[LAYOUT.names.index("platform_sway.e3_rate")] = 2.0 * FAR_M
     assert moved_far(VISION, error, LAYOUT.offsets)
 
 

@@ -12,6 +12,7 @@ from small_flight import LATITUDE, LONGITUDE, deck_events, small_events
 
 from estimation import smoother
 from estimation.config import Config, parse_config
+from estimation.deck import HEAVE
 from estimation.estimator import LandingEstimator
 from estimation.events import Event, EventBatch, GpsPosition, Kind
 from estimation.heave.model import HeaveModel
@@ -92,9 +93,10 @@ def test_both_engines_give_the_same(deck_flight: EventBatch, monkeypatch: pytest
     pytest.importorskip("numba", reason="the compiled engine needs numba")
     taken = np.array([0.05, 1.2566, 1.2566, 1.1, 0.1, 0.1, 0.3, 0.2, 0.1, 1.3, 0.05])
     due_ns = int(deck_flight.rows["stamp_ns"].min()) + 8_000_000_000
+    changed = {HEAVE: np.array([*taken[:7], taken[-1]])}
 
-    def take(self: MotionLearner, settled: Rows) -> list[tuple[int, HeaveModel | None, Array]]:
-        return [(due_ns, None, taken)] if settled.t_ns[0] <= due_ns < settled.t_ns[-1] else []
+    def take(self: MotionLearner, settled: Rows) -> list[tuple[int, HeaveModel | None, dict[int, Array]]]:
+        return [(due_ns, None, changed)] if settled.t_ns[0] <= due_ns < settled.t_ns[-1] else []
 
     monkeypatch.setattr(MotionLearner, "take", take)
     one, other = (smoothed(deck_flight, parse_config(DECK), e) for e in ("compiled", "filterpy"))

@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from small_flight import BOOT, UTC, small_events
 
+from estimation.band import band_derivatives, band_stationary
 from estimation.config import parse_config
-from estimation.deck import MOTION_SIZE, heave_derivatives, heave_stationary, prior_motion
+from estimation.deck import HEAVE, MOTION_SIZE, prior_motion
 from estimation.estimator import EngineName, LandingEstimator
 from estimation.events import AUTOPILOT, Event, EventBatch, VisionFix
 from estimation.heave.model import HeaveModel
@@ -34,7 +35,7 @@ def learned(sigma_m: float) -> Array:
     heave = prior_motion(CONFIG.platform)
     heave[1:4] *= 1.3
     heave[0] = 1.0
-    heave[0] = sigma_m / math.sqrt(heave_stationary(heave)[5, 5])
+    heave[0] = sigma_m / math.sqrt(band_stationary(heave[:7])[5, 5])
     return heave
 
 
@@ -85,15 +86,15 @@ def test_letting_go_keeps_the_motion_and_opens_its_doubt() -> None:
     covariance = A @ A.T + 1e-6 * np.eye(LAYOUT.size)
     x = nominal_zero()
     x[PH0 : PH0 + 6] = rng.normal(size=6) * 0.1
-    moved = heave_derivatives(x[PH0 : PH0 + 6], before)
+    moved = band_derivatives(x[PH0 : PH0 + 6], before[:7])
     memory, scatter = np.full(MEMORY_SIZE, 0.5), np.zeros(4)
     old = covariance.copy()
     let_go(12.0, x, covariance, memory, scatter, heave, P, LAYOUT.offsets, np.empty((0, 0)))
     assert np.array_equal(heave[:7], P[PRIOR_HEAVE : PRIOR_HEAVE + 7]) and len(heave) == MOTION_SIZE
-    np.testing.assert_allclose(heave_derivatives(x[PH0 : PH0 + 6], heave)[3:], moved[3:], rtol=1e-9)
+    np.testing.assert_allclose(band_derivatives(x[PH0 : PH0 + 6], heave[:7])[3:], moved[3:], rtol=1e-9)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
     start = int(LAYOUT.offsets[PLATFORM_HEAVE])
-    sea = heave_stationary(heave)
+    sea = band_stationary(heave[:7])
     grown = covariance[start + 5, start + 5] - old[start + 5, start + 5]
     assert grown == pytest.approx(sea[5, 5], rel=1e-6)
     assert scatter[3] == 12.0 and not memory[7:].any()
@@ -143,8 +144,10 @@ def test_both_engines_let_go_at_the_same_fix(monkeypatch: pytest.MonkeyPatch) ->
     still[0] *= 0.05
     dues = [BOOT + int(s * 1e9) for s in (12.0, STILL_S + 0.5)]
 
-    def take(self: MotionLearner, settled: Rows) -> list[tuple[int, HeaveModel | None, Array]]:
-        return [(due, None, still) for due in dues if settled.t_ns[0] <= due < settled.t_ns[-1]]
+    changed = {HEAVE: np.array([*still[:7], still[-1]])}
+
+    def take(self: MotionLearner, settled: Rows) -> list[tuple[int, HeaveModel | None, dict[int, Array]]]:
+        return [(due, None, changed) for due in dues if settled.t_ns[0] <= due < settled.t_ns[-1]]
 
     monkeypatch.setattr(MotionLearner, "take", take)
     one, other = flown("compiled"), flown("filterpy")
