@@ -104,6 +104,33 @@ def _rotate(m: Array, v: Array) -> Callable[[Array, Array], Array]:
     return product
 
 
+@overload(band.product)
+def _band_product(T: Array, v: Array) -> Callable[[Array, Array], Array]:
+    """Compile the product with a small matrix as loops."""
+    if v.ndim == 1:
+
+        def by_vector(T: Array, v: Array) -> Array:
+            n = T.shape[0]
+            out = np.zeros(n)
+            for i in range(n):
+                for k in range(n):
+                    out[i] += T[i, k] * v[k]
+            return out
+
+        return by_vector
+
+    def by_matrix(T: Array, v: Array) -> Array:
+        n, m = v.shape
+        out = np.zeros((n, m))
+        for i in range(n):
+            for k in range(n):
+                for j in range(m):
+                    out[i, j] += T[i, k] * v[k, j]
+        return out
+
+    return by_matrix
+
+
 @overload(models.put)
 def _put(target: Array, row: int, column: int, scale: float, block: Array) -> Callable[..., None]:
     """Compile the small assignment as loops, without a product in between."""
@@ -127,6 +154,7 @@ for _module in (algebra, band, deck, frames, models, relinearisation, state, upd
                 frames.rotate,
                 models.put,
                 band.band_stationary,
+                band.product,
                 deck.any_sea,
                 deck.prior_motion,
             )

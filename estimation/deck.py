@@ -15,7 +15,15 @@ import math
 import numpy as np
 
 from estimation import parameters as par
-from estimation.band import BAND_PARAMETERS, BAND_SIZE, band_matrix, band_stationary, change_of_band
+from estimation.band import (
+    BAND_PARAMETERS,
+    BAND_SIZE,
+    band_matrix,
+    band_stationary,
+    change_of_band,
+    discrete_band,
+    product,
+)
 from estimation.config import PlatformConfig
 from estimation.frames import Array, compose, quat_exp, quat_to_matrix, rotate, skew
 from estimation.state import (
@@ -85,13 +93,12 @@ def change_motion(
     """
     at, start = places(chain, offsets)
     T = change_of_band(motion[chain : chain + BAND_PARAMETERS], new)
-    x[at : at + BAND_SIZE] = _turned(T, x[at : at + BAND_SIZE].copy())
-    for c in range(P.shape[0]):
-        P[start : start + BAND_SIZE, c] = _turned(T, P[start : start + BAND_SIZE, c].copy())
-    for c in range(P.shape[0]):
-        P[c, start : start + BAND_SIZE] = _turned(T, P[c, start : start + BAND_SIZE].copy())
-    for c in range(trail.shape[0]):
-        trail[start : start + BAND_SIZE, c] = _turned(T, trail[start : start + BAND_SIZE, c].copy())
+    end = start + BAND_SIZE
+    x[at : at + BAND_SIZE] = product(T, x[at : at + BAND_SIZE].copy())
+    P[start:end, :] = product(T, P[start:end, :].copy())
+    P[:, start:end] = product(T, P[:, start:end].T.copy()).T
+    if trail.shape[0] > 0:
+        trail[start:end, :] = product(T, trail[start:end, :].copy())
     for i in range(P.shape[0]):
         for c in range(i):
             mean = 0.5 * (P[i, c] + P[c, i])
@@ -113,73 +120,24 @@ def take_up(
     motion[OFFSET_WALK] = own[2]
 
 
-def _turned(T: Array, v: Array) -> Array:
-    """Return T v (6,), in one order of summation for both engines."""
-    out = np.zeros(BAND_SIZE)
-    for i in range(BAND_SIZE):
-        for k in range(BAND_SIZE):
-            out[i] += T[i, k] * v[k]
-    return out
-
-
 def deck_transition(
     x: Array, y: Array, dt: float, p: Array, motion: Array, offsets: Offsets, F: Array, Q: Array
 ) -> None:
-    """Propagate the platform's blocks from ``x`` into ``y`` over ``dt`` [s]; fill their places in F and Q.
-
-    The chains' transition is a series to third order in dt, the noise Simpson's rule over the step: both good to
-    1e-5 for steps up to 25 ms and periods above 0.8 s.
-    """
+    """Propagate the platform's blocks from ``x`` into ``y`` over ``dt`` [s]; fill their places in F and Q."""
     o = offsets[PLATFORM_OFFSET]
     for i in range(2):
         Q[o + i, o + i] = motion[OFFSET_WALK] ** 2 * dt
     level = offsets[PLATFORM_LEVEL]
     Q[level, level] = p[par.LEVEL_WALK] ** 2 * dt
-    drive = np.zeros(BAND_SIZE)
     for chain in CHAINS:
-        drive[1] = motion[chain]
         at, start = places(chain, offsets)
-        _fill(x, y, at, band_matrix(motion[chain : chain + BAND_PARAMETERS]), drive, dt, F, Q, start)
+        end, place_end = start + BAND_SIZE, at + BAND_SIZE
+        transition, noise = discrete_band(motion[chain : chain + BAND_PARAMETERS], dt)
+        F[start:end, start:end] = transition
+        Q[start:end, start:end] = noise
+        y[at:place_end] = product(transition, x[at:place_end])
     latency = offsets[CAMERA_LATENCY]
     Q[latency, latency] = p[par.LATENCY_WALK] ** 2 * dt
-
-
-def _fill(
-    x: Array, y: Array, place: int, f: Array, drive: Array, dt: float, F: Array, Q: Array, start: int
-) -> None:
-    """Discretise one chain: transition into F, noise into Q, nominal state from x into y."""
-    n = f.shape[0]
-    for c in range(n):
-        column = np.zeros(n)
-        column[c] = 1.0
-        total = _series(f, column, dt)
-        for i in range(n):
-            F[start + i, start + c] = total[i]
-    middle, end = _series(f, drive, 0.5 * dt), _series(f, drive, dt)
-    for i in range(n):
-        value = 0.0
-        for c in range(n):
-            value += F[start + i, start + c] * x[place + c]
-            Q[start + i, start + c] = (
-                dt / 6.0 * (drive[i] * drive[c] + 4.0 * middle[i] * middle[c] + end[i] * end[c])
-            )
-        y[place + i] = value
-
-
-def _series(f: Array, v: Array, t: float) -> Array:
-    """Return exp(f t) v to third order in t."""
-    n = len(v)
-    total, term = v.copy(), v.copy()
-    for order in range(1, 4):
-        following = np.zeros(n)
-        for i in range(n):
-            for k in range(n):
-                following[i] += f[i, k] * term[k]
-            following[i] *= t / order
-        term = following
-        for i in range(n):
-            total[i] += term[i]
-    return total
 
 
 def vision(
