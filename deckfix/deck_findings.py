@@ -16,8 +16,8 @@ LOST_S = 5.0
 FEWEST_JUDGED = 30
 LEAST_COVERAGE = 0.85
 EXCITATION = (
-    "for 20 s over the target rock the vehicle by 6 deg in roll and pitch, each way in about 0.6 s, and run deckfix "
-    "sync; or set the calibrated age as vision.latency_s with its vision.latency_sigma_s"
+    "for 20 s over the target rock the vehicle to and fro by 6 deg, first in roll and then in pitch, each way in about "
+    "0.6 s, and run deckfix sync; or set the calibrated age as vision.latency_s with its vision.latency_sigma_s"
 )
 
 

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 CONVENTION = "latency >= 0: the content is older than its stamp; t_content = map(t_stamp) - latency"
 RECIPE = (
     "to make it observable: hover 4 to 8 m over the target, keep it in view, and rock the vehicle for 20 s by "
-    "6 deg to each side, in roll and in pitch, each way in about 0.6 s; log it, and run deckfix sync again"
+    "6 deg to each side, to and fro, first in roll and then in pitch, each way in about 0.6 s (not in circles, where "
+    "a camera turned about its axis looks late); log it, and run deckfix sync again"
 )
 
 

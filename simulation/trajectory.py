@@ -9,6 +9,7 @@ axis, and the yaw is planned. The angular velocity is the exact derivative of th
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -81,13 +82,15 @@ class Plan(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 class Rock(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
     """Rocking on purpose: for ``duration_s`` from ``start_s`` on [s] the vehicle goes round in a small circle,
-    tilted by ``tilt_deg``, once in ``period_s``. It is let in and out over a second at both ends.
+    tilted by ``tilt_deg``, once in ``period_s``; or to and fro, the first half of the time towards north, then towards
+    east. It is let in and out over a second at both ends.
     """
 
     start_s: float = 0.0
     duration_s: float = 0.0
     tilt_deg: float = 6.0
     period_s: float = 1.2
+    path: Literal["circle", "to and fro"] = "circle"
 
     def motion(self, t_s: Array, gravity_mps2: float) -> Array:
         """Return the displacement, a jet (4, n, 3) [m]."""
@@ -97,9 +100,17 @@ class Rock(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True
             radius * np.array([[1.0], [1.0], [0.0]]),
             np.full((3, 1), omega),
             np.array([[0.0], [np.pi / 2.0], [0.0]]),
-        )
-        shown = step(t_s, self.start_s, 1.0) - step(t_s, self.start_s + self.duration_s - 1.0, 1.0)
-        return product(shown, circle.motion(t_s))
+        ).motion(t_s)
+        if self.path == "circle":
+            return product(self._shown(t_s, self.start_s, self.duration_s), circle)
+        half = 0.5 * self.duration_s
+        for axis in range(2):
+            shown = self._shown(t_s, self.start_s + axis * half, half)
+            circle[:, :, axis : axis + 1] = product(shown, circle[:, :, axis : axis + 1])
+        return circle
+
+    def _shown(self, t_s: Array, start_s: float, duration_s: float) -> Array:
+        return step(t_s, start_s, 1.0) - step(t_s, start_s + duration_s - 1.0, 1.0)
 
 
 def _none() -> Tones:

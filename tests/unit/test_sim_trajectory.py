@@ -4,13 +4,15 @@ path.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 
 from estimation.frames import quat_exp, quat_multiply, quat_to_matrix
 from simulation.platform import Platform, Raft
 from simulation.sea import Sea, beaufort
-from simulation.trajectory import PHASES, Plan, Trajectory, Wind
+from simulation.trajectory import PHASES, Plan, Rock, Trajectory, Wind
 
 GRAVITY = 9.81
 
@@ -92,3 +94,24 @@ def test_plan_refuses_what_does_not_fit() -> None:
         Plan(hover_s=0.0)
     with pytest.raises(ValueError, match="3"):
         Plan(yaw_rad=(0.0,))
+
+
+@pytest.mark.parametrize("path", ["circle", "to and fro"])
+def test_rocking_tilts_as_far_as_is_asked_and_its_jet_is_consistent(
+    path: Literal["circle", "to and fro"],
+) -> None:
+    rock = Rock(start_s=2.0, duration_s=20.0, tilt_deg=6.0, period_s=1.2, path=path)
+    t, h = np.linspace(0.0, 24.0, 4801), 1e-4
+    jet = rock.motion(t, GRAVITY)
+    slope = (rock.motion(t + h, GRAVITY) - rock.motion(t - h, GRAVITY)) / (2.0 * h)
+    np.testing.assert_allclose(jet[1:4], slope[0:3], atol=1e-4)
+    assert not jet[:, (t < 2.0) | (t > 22.0)].any() and not jet[:, :, 2].any()
+    tilt = np.degrees(np.arctan(np.linalg.norm(jet[2], axis=1) / GRAVITY))
+    assert tilt[(t > 3.5) & (t < 10.5)].max() == pytest.approx(6.0, rel=0.01)
+    early, late = (t > 3.5) & (t < 10.5), (t > 13.5) & (t < 20.5)
+    moved = [[float(np.ptp(jet[0, part, axis])) for axis in range(2)] for part in (early, late)]
+    if path == "circle":
+        assert np.allclose(moved, moved[0][0], rtol=0.01)
+    else:
+        assert moved[0][1] == moved[1][0] == 0.0
+        assert moved[0][0] == pytest.approx(moved[1][1], rel=0.01) and moved[0][0] > 0.05
