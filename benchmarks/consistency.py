@@ -1,6 +1,7 @@
 """Is the filter honest? Simulated flights of each scenario, NEES and NIS part by part, and the forecasts' coverage.
 
-    python benchmarks/consistency.py [--full] [--flights 10] [--scenario NAME ...] [--jobs 1] [--json FILE] [--no-gate]
+    python benchmarks/consistency.py [--full] [--flights 10] [--scenario NAME ...] [--first-seed 1000] [--jobs 1]
+                                     [--json FILE] [--no-gate]
 
 Two scenarios without vision, and landings on a raft in Beaufort 1, 2 and 3, with swell, and while GPS wanders by
 metres: search without vision (climb, cruise), tracking (the first 12 s in sight), observation (hover), a loss of vision
@@ -106,6 +107,7 @@ def main() -> None:
     parser.add_argument(
         "--flights", type=int, help=f"of each scenario; {QUICK} without it, {FULL} with --full"
     )
+    parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--full", action="store_true", help="as many flights as the targets ask for")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS))
@@ -118,7 +120,7 @@ def main() -> None:
     for name in arguments.scenario:
         scenario = load_scenario(name)
         begin = time.perf_counter()
-        flights = Parallel(arguments.jobs)(delayed(fly)(scenario, 1000 + seed) for seed in range(count))
+        flights = Parallel(arguments.jobs)(delayed(fly)(scenario, arguments.first_seed + k) for k in range(count))
         wall = time.perf_counter() - begin
         print(f"\n{name}: {scenario.description}; {len(flights)} flights in {wall:.0f} s")
         nees, nis = nees_by_phase(flights), nis_by_phase(flights)

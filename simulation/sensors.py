@@ -41,6 +41,8 @@ _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 _Share = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 
 CLOCKS = (AUTOPILOT, COMPANION, CAMERA)
+START_S = 1.5
+"""About when an estimator that waits at rest starts [s]."""
 
 
 class Stream(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
@@ -353,11 +355,15 @@ class Sensors:
 
 
 def gps_wander(config: GpsConfig, n: int, dt_s: float, rng: np.random.Generator) -> Array:
-    """Return n samples (n, 3) of a receiver's slow error, NED [m]: horizontally with a mean, in height without."""
+    """Return n samples (n, 3) of a receiver's slow error, NED [m]: horizontally with a mean, in height without.
+
+    A random walk has the size that an estimator is told of at one time only: when the estimator starts.
+    """
     across = gauss_markov(n, dt_s, np.full(2, config.bias_sigma_m), np.full(2, config.bias_time_s), rng)
     steps = config.height_bias_walk * math.sqrt(dt_s) * rng.standard_normal(n)
-    steps[:1] = config.height_bias_sigma_m * rng.standard_normal()
-    return np.column_stack([across, np.cumsum(steps)])
+    walk = np.cumsum(steps)
+    walk += config.height_bias_sigma_m * rng.standard_normal() - walk[min(n - 1, round(START_S / dt_s))]
+    return np.column_stack([across, walk])
 
 
 def gauss_markov(n: int, dt_s: float, sigma: Array, time_s: Array, rng: np.random.Generator) -> Array:
