@@ -120,7 +120,9 @@ def main() -> None:
     for name in arguments.scenario:
         scenario = load_scenario(name)
         begin = time.perf_counter()
-        flights = Parallel(arguments.jobs)(delayed(fly)(scenario, arguments.first_seed + k) for k in range(count))
+        flights = Parallel(arguments.jobs)(
+            delayed(fly)(scenario, arguments.first_seed + k) for k in range(count)
+        )
         wall = time.perf_counter() - begin
         print(f"\n{name}: {scenario.description}; {len(flights)} flights in {wall:.0f} s")
         nees, nis = nees_by_phase(flights), nis_by_phase(flights)
