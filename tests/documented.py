@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import log_bytes as lb
 import numpy as np
-from imaged_flight import CAMERA, TARGET, imaged_flight, write_flight
+from imaged_flight import CAMERA, PLAN, TARGET, imaged_flight, write_flight
 from small_flight import BOOT, small_log, small_recording
 
 from logs.recording import Recording
@@ -21,29 +21,18 @@ from simulation.flight import parse_scenario, simulate
 START_US, SECONDS = 50_000_000, 5.0
 """The autopilot's logs begin so long after its start, so that a video at 52.3 s falls into them."""
 
-ROCKING = """
+ROCKING = f"""
 description = "a hover with rocking above the deck"
-seed = 3
-[plan]
-rest_s = 2.5
-climb_s = 3.0
-leg_s = 1.5
+{PLAN}
 hover_s = 9.0
 descent_s = 3.0
-deck_s = 0.5
-altitude_m = 5.0
-start_m = [-2.0, -1.5, -1.0]
-legs_m = []
-yaw_rad = [0.4, 0.3]
-[sea]
-beaufort = 2
 [rock]
 start_s = 7.5
 duration_s = 8.0
 tilt_deg = 6.0
 period_s = 1.2
 [streams]
-imu = { rate_hz = 50.0 }
+imu = {{ rate_hz = 50.0 }}
 [streams.timesync]
 rate_hz = 10.0
 delay_s = 0.001

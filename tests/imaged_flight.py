@@ -21,24 +21,28 @@ CAMERA = Camera.from_fov(320, 240, np.deg2rad(62.2))
 TARGET = RingTarget.recommended()
 FIRST_S, RATE_HZ, COUNT = 6.5, 20.0, 60
 DELAY_S = 0.03
-SCENARIO = """
-description = "up, and a hover above the deck"
+PLAN = """
 seed = 3
+[sea]
+beaufort = 2
 [plan]
 rest_s = 2.5
 climb_s = 3.0
 leg_s = 1.5
-hover_s = 3.0
-descent_s = 4.0
 deck_s = 0.5
 altitude_m = 5.0
 start_m = [-2.0, -1.5, -1.0]
 legs_m = []
 yaw_rad = [0.4, 0.3]
-[sea]
-beaufort = 2
+"""
+"""Up to five metres above the deck; how long it hovers there and how fast it comes down is to follow."""
+SCENARIO = f"""
+description = "up, and a hover above the deck"
+{PLAN}
+hover_s = 3.0
+descent_s = 4.0
 [streams]
-imu = { rate_hz = 100.0 }
+imu = {{ rate_hz = 100.0 }}
 [filter.platform]
 use = true
 learn_s = 0.0
