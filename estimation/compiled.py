@@ -54,7 +54,18 @@ from estimation.rows import (
     Int,
     Rows,
 )
-from estimation.state import ATTITUDE, P0, PL0, PLATFORM_HEAVE, PLATFORM_SWAY, SIZES, Layout, Offsets, plus
+from estimation.state import (
+    ATTITUDE,
+    P0,
+    PL0,
+    PLATFORM_HEAVE,
+    PLATFORM_SWAY,
+    PO0,
+    SIZES,
+    Layout,
+    Offsets,
+    plus,
+)
 from estimation.trail import AFTER, EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.update import (
     MAX_STEP_S,
@@ -270,7 +281,7 @@ def _fuse(
     if kind == VISION:
         seen_place(r, R, x, p, result[8:14])
         result[15:18] = moved
-    result[18] = math.log(determinant(S, m))
+    result[20] = math.log(determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     mark = 0
@@ -302,6 +313,7 @@ def _fuse(
     reset_attitude(P, right_jacobian(error[att : att + 3]), att)
     x = plus(x, error, offsets)
     result[14] = x[PL0]
+    result[18:20] = x[PO0 : PO0 + 2]
     if stop > 0:
         for i in range(first, stop):
             for j in range(first, stop):

@@ -20,7 +20,7 @@ from estimation.frames import Array
 from estimation.outcome import Outcome
 from estimation.relinearise import moved_far, relinearise
 from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
-from estimation.state import ATTITUDE, P0, PL0, Layout, plus
+from estimation.state import ATTITUDE, P0, PL0, PO0, Layout, plus
 from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.watch import LET_GO, let_go, unexplained
 
@@ -197,6 +197,7 @@ class FilterPyEngine:
             error[first:stop] = 0.0
         s.x = plus(s.x, error, self.layout.offsets)
         rows.seen[i, 6] = s.x[PL0]
+        rows.seen[i, 10:12] = s.x[PO0 : PO0 + 2]
         P = ekf.P
         att = int(self.layout.offsets[ATTITUDE])
         G = models.right_jacobian(error[att : att + 3])

@@ -123,20 +123,21 @@ class MotionLearner:
             if not self._t_ns or t_ns - self._t_ns[-1] > GAP_S * 1e9:
                 self._settled_ns = t_ns + int(SETTLING_S * 1e9)
             self._t_ns.append(t_ns)
-            self._seen.append(seen if t_ns >= self._settled_ns else [*seen[:6], math.nan, *seen[7:]])
+            unsettled = [*seen[:6], math.nan, *seen[7:10], math.nan, math.nan]
+            self._seen.append(seen if t_ns >= self._settled_ns else unsettled)
 
-    def _drift(self, level: Array) -> Array:
-        """Return how far the level (n,) was, at each fix, from what it is at the last; before it had settled (NaN) as
-        far as once it had.
+    def _drift(self, mean: Array) -> Array:
+        """Return how far a mean (n,), the level or a coordinate of the place, was at each fix from what it is at the
+        last; before it had settled (NaN) as far as once it had.
 
-        The level follows the error of the vehicle's own height, which is large against a small sea's heave and as slow
-        as a swell.
+        The means follow the errors of the vehicle's own place, which are large against a small sea and as slow as a
+        swell.
         """
-        settled = np.flatnonzero(np.isfinite(level))
+        settled = np.flatnonzero(np.isfinite(mean))
         if not len(settled):
-            return np.zeros(len(level))
-        following = settled[np.minimum(np.searchsorted(settled, np.arange(len(level))), len(settled) - 1)]
-        return np.asarray(level[following] - level[settled[-1]])
+            return np.zeros(len(mean))
+        following = settled[np.minimum(np.searchsorted(settled, np.arange(len(mean))), len(settled) - 1)]
+        return np.asarray(mean[following] - mean[settled[-1]])
 
     def _fit(self) -> HeaveModel | None:
         assert self._due_ns is not None
@@ -160,12 +161,13 @@ class MotionLearner:
             axis = self._count % SWAY_EVERY
             if axis < len(self.sway):
                 place, sigma = seen[:, 2 + 2 * axis], np.sqrt(seen[:, 3 + 2 * axis])
-                inertial = place - fast_part(t, seen[:, 7 + axis])
-                model = fit(t, inertial, sigma, window_s=self.window_s, previous=self.sway[axis])
+                mean, moved = self._drift(seen[:, 10 + axis]), seen[:, 7 + axis]
+                swing = place - mean + fast_part(t, mean - moved)
+                model = fit(t, swing, sigma, window_s=self.window_s, previous=self.sway[axis])
                 self.sway[axis] = model
                 if model.learned is not None:
                     self._take(CHAINS[1 + axis], model)
-                self._walks[axis] = _walk(t, place)
+                self._walks[axis] = min(_walk(t, place), _walk(t, place - moved))
                 self.parameters[OFFSET_WALK] = max(float(self._prior[OFFSET_WALK]), *self._walks)
             self._count += 1
         return self.model

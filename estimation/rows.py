@@ -22,7 +22,7 @@ PENDING = -1
 
 T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = range(10)
 """Columns of ``Rows.ints``."""
-VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 30, 31
+VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 32, 33
 """First columns in ``Rows.floats``, and their number."""
 HEAVE_MODEL = 10
 """Kind of a row that is no measurement: from here on the platform moves with the parameters in ``value``, ``own``."""
@@ -30,16 +30,17 @@ HEAVE_MODEL = 10
 
 @dataclass(slots=True)
 class Rows:
-    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 31), with a view for each column.
+    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 33), with a view for each column.
 
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
     the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
     the inertial clock was past the content when it arrived. ``value`` and ``own`` (n, 6) are the event's value and
     covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved, 2 where the learned
     heave was let go) and ``result`` (n, 8):
-    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 10): where a fix shows the deck
-    (``estimation.deck.seen_place``), the level after it was fused and how far measurements had moved the vehicle north
-    and east [m], and ``log_det``: logarithm of the determinant of the innovation's covariance.
+    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 12): where a fix shows the deck
+    (``estimation.deck.seen_place``), the level after it was fused, how far measurements had moved the vehicle north,
+    east and down, and the mean place after it [m], and ``log_det``: logarithm of the determinant of the innovation's
+    covariance.
     """
 
     ints: Int
@@ -124,7 +125,7 @@ class Rows:
     @property
     def seen(self) -> Array:
         """Height, north and east of the deck as a fix shows it [m], each with its variance; the level after it; how far
-        measurements had moved the vehicle north and east.
+        measurements had moved the vehicle north, east and down; the mean place after it.
         """
         return self.floats[:, SEEN:LOG_DET]
 
