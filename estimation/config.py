@@ -446,10 +446,17 @@ class LandingConfig(_Table, frozen=True):
     speed_mps: Annotated[float, _positive("largest horizontal speed relative to the target", "m/s")] = 4.0
     climb_mps: Annotated[float, _positive("largest climb rate, and that of an abort", "m/s")] = 2.0
     position_gain: Annotated[float, _positive("velocity asked for over the position's error", "1/s")] = 0.8
+    follow_gain: Annotated[
+        float,
+        _positive(
+            "the same over the deck, horizontally; above 1 / (2 response_level_s) it overshoots a little",
+            "1/s",
+        ),
+    ] = 1.2
     drift_gain: Annotated[
         float,
         _not_negative(
-            "change of the drift that is followed over the position's error: a quarter of the position gain's square "
+            "change of the drift that is followed over the position's error: a quarter of the following gain's square "
             "does not overshoot",
             "1/s^2",
         ),

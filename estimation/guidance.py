@@ -21,6 +21,8 @@ from estimation.state import PL0
 if TYPE_CHECKING:
     from estimation.output import Estimate
 
+FOLLOW_MPS2 = 2.0
+"""Over the deck the vehicle comes to rest at the target with no more than this."""
 CONTACT_SPREAD_S = 0.3
 """A quiet moment lasts from this long before the contact expected until this long after it."""
 
@@ -141,11 +143,14 @@ def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
         velocity[2] = _vertical(-high - float(e.position_m[2]), c)
         if p.mode is Mode.ABORT and p.reason is not Reason.GIVEN_UP:
             velocity = climb
+            if len(e.deck):
+                # Away from the deck, also from one that comes up.
+                velocity[2] -= max(0.0, deck_rate_ahead(e, seen.forecast, c.response_s))
         return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.track_tilt_rad, aim, nan, nan)
     velocity = np.empty(3)
     velocity[:2] = sway_ahead(e, seen.forecast, c.response_level_s)
     velocity[:2] += p.drift_mps
-    velocity[:2] += _towards(-e.deck[:2], c.speed_mps, c.position_gain)
+    velocity[:2] += _towards(-e.deck[:2], c.speed_mps, c.follow_gain, FOLLOW_MPS2)
     if p.mode is not Mode.LANDING:
         altitude = c.track_share * search_altitude_m(c)
         aim = np.array([0.0, 0.0, -altitude])
@@ -195,10 +200,13 @@ def sway_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) -> Ar
     return now.copy() if forecast is None else forecast.sway_at(ahead_s)
 
 
-def _towards(offset: Array, limit: float, gain: float) -> Array:
-    """Return the velocity (2,) that closes an offset (2,), of limited length."""
+def _towards(offset: Array, limit: float, gain: float, slowing_mps2: float = math.inf) -> Array:
+    """Return the velocity (2,) that closes an offset (2,), of limited length, and from which a vehicle that slows down
+    by ``slowing_mps2`` comes to rest there.
+    """
     wanted = gain * offset
     length = float(np.hypot(wanted[0], wanted[1]))
+    limit = min(limit, math.sqrt(2.0 * slowing_mps2 * length / gain))
     return wanted if length <= limit else np.asarray(wanted * (limit / length))
 
 

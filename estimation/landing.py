@@ -166,7 +166,8 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
     low = height < c.hold_height_m + HOLD_TOLERANCE_M
     p = _holding(p, low, seen)
     waited = _held_s(p, seen)
-    if low and probably_inside(e, c.r_land_m) >= c.land_probability and tilt_rad(e) < c.track_tilt_rad:
+    ahead = min(time_to_contact(height, c), c.response_s)
+    if low and probably_inside(e, c.r_land_m, ahead) >= c.land_probability and tilt_rad(e) < c.track_tilt_rad:
         asked = c.quiet_probability * max(0.0, 1.0 - waited / c.wait_s)
         if waited >= c.wait_s:
             return replace(p, descent_ns=seen.now_ns, reason=Reason.WAITED_LONG_ENOUGH)

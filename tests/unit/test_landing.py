@@ -11,7 +11,7 @@ import pytest
 from estimation.ahead import DeckForecast
 from estimation.config import Config, ConfigError, LandingConfig, parse_config
 from estimation.frames import euler_to_quat
-from estimation.guidance import descent_rate, search_altitude_m, time_to_contact
+from estimation.guidance import FOLLOW_MPS2, descent_rate, search_altitude_m, time_to_contact
 from estimation.landing import step
 from estimation.modes import EXPLANATIONS, Decision, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
@@ -138,6 +138,24 @@ def test_what_stands_before_it_could_be_led_up_stays() -> None:
     p, said = step(landing(), seen, LandingConfig())
     assert said.mode is Mode.LANDING
     assert p.descent_ns is not None
+
+
+def test_over_the_deck_what_is_off_is_closed_and_no_faster_than_it_can_come_to_rest() -> None:
+    c = LandingConfig()
+    still = estimate(0, (0.1, 0.0, -1.5))
+    _, said = step(landing(False), Situation(10**9, replace(still, t_ns=10**9), 0.1), c)
+    assert said.velocity_mps[:2] == pytest.approx([-0.1 * c.follow_gain, 0.0])
+    far = estimate(10**9, (4.0, 0.0, -1.5))
+    _, said = step(landing(False), Situation(10**9, far, 0.1), c)
+    assert said.velocity_mps[0] == pytest.approx(-math.sqrt(2.0 * FOLLOW_MPS2 * 4.0))
+
+
+@pytest.mark.parametrize(("rate", "climb"), [(0.4, 2.4), (-0.4, 2.0)])
+def test_breaking_off_leads_away_from_a_deck_that_comes_up(rate: float, climb: float) -> None:
+    c = LandingConfig()
+    p = replace(landing(), mode=Mode.ABORT, reason=Reason.OUTSIDE_R_LAND, descent_ns=None)
+    seen = Situation(10**9, estimate(10**9, (0.3, 0.0, -0.4), rate), 0.1, forecast(10**9, rate))
+    assert step(p, seen, c)[1].velocity_mps[2] == pytest.approx(-climb)
 
 
 def test_a_drifting_place_is_followed_without_a_lasting_error() -> None:
