@@ -6,7 +6,7 @@ not counted. Speed is the ratio of their wall times, given as median (smallest..
 the machine before each run is printed, since another's work on it shows in the ratio. The tables must be equal, byte
 for byte, whoever did the work: one worker, two, and the two workers of a Dask cluster where dask is installed.
 
-    python benchmarks/fleet.py [--flights 100] [--repetitions 2] [--reports] [--json FILE] [--no-gate]
+    python benchmarks/fleet.py [--flights 100] [--repetitions 2] [--no-reports] [--json FILE] [--no-gate]
 
 Exit status 1 when a target is missed, unless --no-gate is given.
 """
@@ -90,12 +90,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--flights", type=int, default=100)
     parser.add_argument("--repetitions", type=int, default=2)
-    parser.add_argument("--reports", action="store_true", help="write the reports too (5 MB each)")
+    parser.add_argument("--no-reports", action="store_true", help="leave out the reports (5 MB each)")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--no-gate", action="store_true", help="exit with 0 also where a target is missed")
     options = parser.parse_args(arguments)
     begin = time.perf_counter()
-    extra = [] if options.reports else ["--no-reports"]
+    extra = ["--no-reports"] if options.no_reports else []
     walls: dict[int, list[float]] = {1: [], 2: []}
     loads: list[float] = []
     tables: dict[str, bytes] = {}
