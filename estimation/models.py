@@ -107,9 +107,9 @@ def transition(
     """Propagate the nominal state over ``dt`` [s]; write the error state's transition into F and noise into Q.
 
     ``gyro`` [rad/s] and ``accel`` [m/s^2] are the raw mean over the interval; ``scatter`` holds the additional white
-    noise densities squared of accelerometer [(m/s^2)^2/Hz] and gyro [(rad/s)^2/Hz]; ``motion`` are the deck's seven
-    parameters (``estimation.deck``), read where its blocks are on. F and Q, (n, n), are written whole. Returns the
-    new nominal state. Strapdown in the local tangent plane; the Earth's rate is left to the gyro bias
+    noise densities squared of accelerometer [(m/s^2)^2/Hz] and gyro [(rad/s)^2/Hz]; ``motion`` are the deck's
+    parameters (22,) (``estimation.deck``), read where its blocks are on. F and Q, (n, n), are written whole. Returns
+    the new nominal state. Strapdown in the local tangent plane; the Earth's rate is left to the gyro bias
     (docs/limits.md).
     """
     n = F.shape[0]

@@ -25,7 +25,8 @@ T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = ran
 VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 32, 33
 """First columns in ``Rows.floats``, and their number."""
 HEAVE_MODEL = 10
-"""Kind of a row that is no measurement: from here on the platform moves with the parameters in ``value``, ``own``."""
+"""Kind of a row that is no measurement: from here on a chain of the platform's motion has the parameters in ``value``
+and ``own`` (``estimation.deck.take_up``)."""
 
 
 @dataclass(slots=True)
@@ -206,7 +207,7 @@ class FilterState:
     ``clock`` holds the state's time, the last inertial sample's and the start's [ns]; ``imu`` that sample;
     ``scatter`` the vibration measure (2), the mean squared rotation and when a learned heave was last let go [s since
     the start]; ``memory`` what is remembered of each sensor; ``motion`` the parameters of the deck's motion
-    (``estimation.deck``), ``moved`` how far measurements have moved the vehicle north and east [m].
+    (``estimation.deck``), ``moved`` how far measurements have moved the vehicle, NED (3,) [m].
     """
 
     clock: Int
