@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from estimation.band import BAND_PARAMETERS, BAND_SIZE, band_matrix, band_stationary
-from estimation.deck import HEAVE, SWAY_EAST, SWAY_NORTH
+from estimation.deck import DRIFT_TIME_S, HEAVE, SWAY_EAST, SWAY_NORTH
 from estimation.frames import Array
 
 
@@ -25,7 +25,7 @@ class DeckForecast:
     ``height_m``, ``height_sigma_m``, ``rate_mps``, ``rate_sigma_mps`` (m,); ``skill`` (m,) is 1 - variance of the
     rate over that of the sea: 1 is certain, 0 knows nothing but the sea. ``sea_rate_sigma_mps`` is the rate's 1-sigma
     in that sea, ``learned`` tells whether the sea was learned in flight (else it is the configuration's prior).
-    ``sway_mps`` (m, 2) is the velocity of the sway about the anchored place, north and east.
+    ``sway_mps`` (m, 2) is the deck's horizontal velocity, north and east, of the place's drift and of the sway.
     """
 
     t_ns: int
@@ -45,7 +45,7 @@ class DeckForecast:
         return rate, float(np.interp(horizon_s, self.horizon_s, self.rate_sigma_mps))
 
     def sway_at(self, horizon_s: float) -> Array:
-        """Return the sway's velocity (2,) [m/s] at a horizon, interpolated, and held beyond the ends."""
+        """Return the deck's horizontal velocity (2,) [m/s] at a horizon, interpolated, and held beyond the ends."""
         return np.array([np.interp(horizon_s, self.horizon_s, axis) for axis in self.sway_mps.T])
 
     def quiet_probability(self, begin_s: float, end_s: float, rate_limit_mps: float) -> float:
@@ -92,9 +92,10 @@ class DeckForecaster:
         motion: Array,
         learned: bool,
         sway: Array,
+        drift: Array,
     ) -> DeckForecast:
-        """Return the forecast from the heave states (6,), their covariance (6, 6), the states of the sway (12,) and
-        the motion's parameters (22,) at ``t_ns``.
+        """Return the forecast from the heave states (6,), their covariance (6, 6), the states of the sway (12,), the
+        drift's velocity (2,) and the motion's parameters (22,) at ``t_ns``.
         """
         if self._parameters is None or not np.array_equal(motion, self._parameters):
             self._prepare(motion)
@@ -108,9 +109,11 @@ class DeckForecaster:
         with np.errstate(invalid="ignore", divide="ignore"):
             skill = np.where(self._sea[1] > 0.0, 1.0 - variance[:, 1] / self._sea[1], 0.0)
         sigma = np.sqrt(variance)
+        swing = np.einsum("mak,ak->ma", self._sway, sway.reshape(2, BAND_SIZE))
+        remains = np.exp(-self.horizon_s / DRIFT_TIME_S)
         return DeckForecast(
             t_ns, self.horizon_s, mean[:, 0], sigma[:, 0], mean[:, 1], sigma[:, 1], skill,
-            math.sqrt(self._sea[1]), learned, np.einsum("mak,ak->ma", self._sway, sway.reshape(2, BAND_SIZE)),
+            math.sqrt(self._sea[1]), learned, swing + remains[:, None] * drift,
         )  # fmt: skip
 
     def _prepare(self, motion: Array) -> None:

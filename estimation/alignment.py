@@ -45,6 +45,7 @@ from estimation.state import (
     GPS_BIAS,
     GYRO_BIAS,
     P0,
+    PLATFORM_DRIFT,
     PLATFORM_LEVEL,
     PLATFORM_OFFSET,
     POSITION,
@@ -472,6 +473,7 @@ class Aligner:
 
         radius = UNKNOWN_PLACE_M if d.anchor_radius_m is None else d.anchor_radius_m
         put(PLATFORM_OFFSET, np.eye(2) * radius**2)
+        put(PLATFORM_DRIFT, np.eye(2) * d.drift_sigma_mps**2)
         put(PLATFORM_LEVEL, np.eye(1) * UNKNOWN_LEVEL_M**2)
         motion = prior_motion(d)
         for chain in CHAINS:

@@ -32,7 +32,7 @@ from estimation.algebra import (
 )
 from estimation.band import BAND_SIZE
 from estimation.codecache import jitted
-from estimation.deck import HEAVE, add_drift, deck_output, seen_place, take_up
+from estimation.deck import HEAVE, deck_output, seen_place, take_up
 from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
 from estimation.outcome import Outcome
@@ -58,7 +58,9 @@ from estimation.state import (
     ATTITUDE,
     P0,
     PL0,
+    PLATFORM_DRIFT,
     PLATFORM_HEAVE,
+    PLATFORM_OFFSET,
     PLATFORM_SWAY,
     PO0,
     SIZES,
@@ -224,6 +226,10 @@ def _propagate_covariance(P: Array, F: Array, Q: Array, span: Int) -> None:
 def _spans(layout: Layout) -> Int:
     """Return the first and last-but-one column in which each row of F (n, 2) is not zero, behind the ninth row."""
     span = np.array([[i, i + 1] for i in range(layout.size)], dtype=np.int64)
+    place, drift = int(layout.offsets[PLATFORM_OFFSET]), int(layout.offsets[PLATFORM_DRIFT])
+    if place >= 0:
+        for axis in range(SIZES[PLATFORM_OFFSET]):
+            span[place + axis, 1] = drift + axis + 1
     for block, size in ((PLATFORM_SWAY, BAND_SIZE), (PLATFORM_HEAVE, BAND_SIZE)):
         start = int(layout.offsets[block])
         if start >= 0:
@@ -422,7 +428,6 @@ def _advance(
                 y, A = deck_output(state, motion, offsets, n)
                 out_deck[count] = y
                 congruence(A, P, out_deck_covariance[count])
-                add_drift(motion, out_deck_covariance[count])
             count += 1
             if recording:
                 if trail_t[trail_count[0] - 1] != t:

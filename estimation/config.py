@@ -276,6 +276,13 @@ class PlatformConfig(_Table, frozen=True):
     offset_walk: Annotated[
         float, _not_negative("random walk of the mean place; 0.01: 0.03 m after 10 s", "m/rts")
     ] = 0.01
+    drift_sigma_mps: Annotated[
+        float,
+        _not_negative(
+            "1-sigma of the velocity, per axis, at which the mean place drifts on its mooring, before it is learned",
+            "m/s",
+        ),
+    ] = 0.075
     anchor_radius_m: Annotated[
         float | None,
         _number(
@@ -456,7 +463,7 @@ class LandingConfig(_Table, frozen=True):
     drift_gain: Annotated[
         float,
         _not_negative(
-            "change of the drift that is followed over the position's error: a quarter of the following gain's square "
+            "change of the velocity that is added over the position's error: a quarter of the following gain's square "
             "does not overshoot",
             "1/s^2",
         ),

@@ -1,11 +1,11 @@
 """Models of the platform: how it moves, how a camera sees it, and where it is relative to the vehicle.
 
-Plain functions of arrays that numba compiles as they stand. The platform is an anchored place (random walk), sway
-about it to north and east, a level (random walk, positive up) and heave about it. Sway and heave are chains
-(``estimation.band``), which have no gain at rest and leave place and level to their own states.
+Plain functions of arrays that numba compiles as they stand. The platform is an anchored place that drifts with a
+velocity of its own, sway about it to north and east, a level (random walk, positive up) and heave about it. Sway and
+heave are chains (``estimation.band``), which have no gain at rest and leave place and level to their own states.
 
 ``motion`` are the parameters of this motion (22,), which are learned in flight: seven each of heave, sway north and
-sway east, in this order, and the random walk of the place [m/rts].
+sway east, in this order, and the 1-sigma of the drift's velocity [m/s].
 """
 
 from __future__ import annotations
@@ -33,8 +33,10 @@ from estimation.state import (
     CL0,
     CM0,
     P0,
+    PD0,
     PH0,
     PL0,
+    PLATFORM_DRIFT,
     PLATFORM_HEAVE,
     PLATFORM_LEVEL,
     PLATFORM_OFFSET,
@@ -50,14 +52,14 @@ from estimation.state import (
     Offsets,
 )
 
-HEAVE, SWAY_NORTH, SWAY_EAST, OFFSET_WALK, MOTION_SIZE = 0, 7, 14, 21, 22
-"""First places in ``motion`` of the parameters of each chain, then of the place's random walk, and their number."""
+HEAVE, SWAY_NORTH, SWAY_EAST, DRIFT_SPEED, MOTION_SIZE = 0, 7, 14, 21, 22
+"""First places in ``motion`` of the parameters of each chain, then of the speed of the drift, and their number."""
 CHAINS = (HEAVE, SWAY_NORTH, SWAY_EAST)
 ANY_SEA = np.array([1.0 / 1.6, 1.0, 1.6])
 """Frequencies of the sections of a motion without a form of its own, over their middle: with a damping of 0.5, short
 wind sea and swell both lie within what it expects."""
-DRIFT_TIME_S = 3.0
-"""After so long a random walk of the place is as far as the steady velocity that it stands for takes it [s]."""
+DRIFT_TIME_S = 10.0
+"""Correlation time of the velocity with which the place drifts: a sixth of the minute that a mooring swings in [s]."""
 OUTPUT_SIZE = 8
 """Relative position (3), relative velocity (3), height and its rate."""
 
@@ -66,7 +68,7 @@ def prior_motion(platform: PlatformConfig) -> Array:
     """Return the parameters of the motion (22,) before it is learned: chains of any sea, spread about their periods."""
     heave = any_sea(platform.heave_sigma_m, 2.0 * math.pi / platform.heave_period_s, platform.heave_damping)
     sway = any_sea(platform.sway_sigma_m, 2.0 * math.pi / platform.sway_period_s, platform.sway_damping)
-    return np.array([*heave, *sway, *sway, platform.offset_walk])
+    return np.array([*heave, *sway, *sway, platform.drift_sigma_mps])
 
 
 def any_sea(sigma_m: float, omega_radps: float, damping: float) -> Array:
@@ -111,22 +113,34 @@ def take_up(
     value: Array, own: Array, x: Array, P: Array, motion: Array, offsets: Offsets, trail: Array
 ) -> None:
     """Take up what was learned of a chain, from a row: ``own`` (6,) its gain, its first place in ``motion`` and the
-    place's random walk, ``value`` (6,) its other parameters.
+    speed of the drift, ``value`` (6,) its other parameters.
     """
     new = np.empty(BAND_PARAMETERS)
     new[0] = own[0]
     new[1:] = value
     change_motion(x, P, motion, int(own[1]), new, offsets, trail)
-    motion[OFFSET_WALK] = own[2]
+    motion[DRIFT_SPEED] = own[2]
 
 
 def deck_transition(
     x: Array, y: Array, dt: float, p: Array, motion: Array, offsets: Offsets, F: Array, Q: Array
 ) -> None:
     """Propagate the platform's blocks from ``x`` into ``y`` over ``dt`` [s]; fill their places in F and Q."""
-    o = offsets[PLATFORM_OFFSET]
+    # The drift's velocity is a first-order Gauss-Markov process; how far its noise takes the place is a series in dt.
+    time = DRIFT_TIME_S
+    remains = math.exp(-dt / time)
+    carries = time * (1.0 - remains)
+    variance = motion[DRIFT_SPEED] ** 2
     for i in range(2):
-        Q[o + i, o + i] = motion[OFFSET_WALK] ** 2 * dt
+        o, d = offsets[PLATFORM_OFFSET] + i, offsets[PLATFORM_DRIFT] + i
+        F[o, d] = carries
+        F[d, d] = remains
+        Q[o, o] = p[par.OFFSET_WALK] ** 2 * dt + variance * dt**3 / time * (2.0 / 3.0 - 0.5 * dt / time)
+        Q[o, d] = variance * carries**2 / time
+        Q[d, o] = Q[o, d]
+        Q[d, d] = variance * (1.0 - remains**2)
+        y[PO0 + i] = x[PO0 + i] + carries * x[PD0 + i]
+        y[PD0 + i] = remains * x[PD0 + i]
     level = offsets[PLATFORM_LEVEL]
     Q[level, level] = p[par.LEVEL_WALK] ** 2 * dt
     for chain in CHAINS:
@@ -250,17 +264,12 @@ def deck_output(x: Array, motion: Array, offsets: Offsets, n: int) -> tuple[Arra
                 A[7, start + k] = rate[k]
     for axis in range(2):
         y[axis] -= x[PO0 + axis]
+        y[3 + axis] -= x[PD0 + axis]
         A[axis, offsets[PLATFORM_OFFSET] + axis] = -1.0
+        A[3 + axis, offsets[PLATFORM_DRIFT] + axis] = -1.0
     y[2] += x[PL0]
     y[6] = x[PL0] + x[PH0 + 5]
     for row in (2, 6):
         A[row, offsets[PLATFORM_LEVEL]] = 1.0
     A[6, offsets[PLATFORM_HEAVE] + 5] = 1.0
     return y, A
-
-
-def add_drift(motion: Array, covariance: Array) -> None:
-    """Add to the covariance of what is reported, (8, 8), the velocity of the place's drift, which is no state."""
-    variance = motion[OFFSET_WALK] ** 2 / DRIFT_TIME_S
-    covariance[3, 3] += variance
-    covariance[4, 4] += variance

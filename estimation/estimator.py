@@ -53,7 +53,7 @@ from estimation.rows import (
     Rows,
 )
 from estimation.screening import malformed, malformed_one
-from estimation.state import BG0, PH0, PLATFORM_HEAVE, PS0, Layout
+from estimation.state import BG0, PD0, PH0, PLATFORM_HEAVE, PS0, Layout
 from estimation.tape import Tape
 
 EngineName = Literal["auto", "filterpy", "compiled"]
@@ -201,7 +201,8 @@ class LandingEstimator:
         block = slice(start, start + BAND_SIZE)
         learned = self._learner is not None and HEAVE in self._learner.blocks
         x, sway = s.x[PH0 : PH0 + BAND_SIZE], s.x[PS0 : PS0 + 2 * BAND_SIZE]
-        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], s.motion, learned, sway)
+        drift = s.x[PD0 : PD0 + 2]
+        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], s.motion, learned, sway, drift)
 
     def finish(self) -> None:
         """Settle what is still in the window; measurements that no inertial sample followed were in the future."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimation import models, update
-from estimation.deck import HEAVE, add_drift, deck_output, seen_place, take_up
+from estimation.deck import HEAVE, deck_output, seen_place, take_up
 from estimation.frames import Array
 from estimation.outcome import Outcome
 from estimation.relinearise import moved_far, relinearise
@@ -245,7 +245,6 @@ class FilterPyEngine:
         if out.deck.shape[1]:
             out.deck[k], A = deck_output(s.x, s.motion, self.layout.offsets, self.layout.size)
             out.deck_covariance[k] = A @ s.P @ A.T
-            add_drift(s.motion, out.deck_covariance[k])
         out.count = k + 1
 
 

@@ -51,7 +51,7 @@ STATION_M = 3.0
 MOST_LOSSES = 6
 """A target that was lost so often, in tracking or observation, is no target."""
 FASTEST_DRIFT_MPS = 0.5
-"""A platform on its anchor drifts no faster."""
+"""The velocity that a lasting error may add: more than a drift unforeseen and an autopilot's own error come to."""
 LEFT_PROBABILITY = 0.5
 """The observation ends when being inside r_track is no more probable than this."""
 
@@ -223,8 +223,8 @@ def _mode_s(p: Progress, seen: Situation) -> float:
 
 
 def _followed(before: Progress, after: Progress, seen: Situation, c: LandingConfig) -> Progress:
-    """Correct the drift by the place's error while the target is in view: what the position's gain alone would have to
-    answer with a lasting error.
+    """Add velocity by the place's error while the target is in view: the position's gain alone would have to answer
+    with a lasting error.
     """
     e = seen.estimate
     if after.mode not in _OVER_THE_DECK or e is None:

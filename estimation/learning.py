@@ -7,13 +7,14 @@ often. All three are spectra learned from where each fix shows the deck (``estim
 
 from __future__ import annotations
 
+import importlib
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from estimation.band import BAND_PARAMETERS, band_matrix, band_stationary
-from estimation.deck import CHAINS, DRIFT_TIME_S, HEAVE, OFFSET_WALK, any_sea
+from estimation.deck import CHAINS, DRIFT_SPEED, HEAVE, any_sea
 from estimation.events import Kind
 from estimation.frames import Array
 from estimation.heave.bandpass import BandPass
@@ -35,14 +36,16 @@ SETTLING_S, GAP_S = 6.0, 2.0
 """So long after the first fix, and after a gap of the second length, the level is still finding its place [s]."""
 BEFORE_S = 3.0
 """Of the time before a learned heave was let go, so much belongs to what came then [s]."""
-SWAY_S = 12.0
-"""Shortest observation that the sway is learned from [s]."""
 SWAY_EVERY = 6
 """So many fits of the heave to one of the sway, north and then east."""
 SLOW_S = 14.0
 """Means over so long show the drift of the place without its sway [s]."""
 SLOW_SIGMA_S = 4.0
 """Width of the average that tells slow from fast: a fifth of it is left at the slowest sea's frequency [s]."""
+DRIFT_SEEN = 0.57
+"""Share of the variance of the drift's velocity that is left in how far such means move in a second."""
+DRIFT_PRIOR = 4.0
+"""Weight of the speed that is expected of the drift, in velocities seen: half a minute shows two, on both axes."""
 STILL_M = 0.01
 """Smallest 1-sigma that a platform is believed to move with [m]."""
 SEA_RADPS = (0.44, 5.0)
@@ -69,19 +72,20 @@ class MotionLearner:
     _due_ns: int | None = None
     _settled_ns: int = 0
     _begin_ns: int | None = None
-    _walks: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    _drifts: list[Array] = field(default_factory=lambda: [np.empty(0), np.empty(0)])
     _count: int = 0
     _changed: set[int] = field(default_factory=set)
     _prior: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        """Keep the prior."""
+        """Keep the prior, and load now what the first fit would stop a flight for."""
+        importlib.import_module("scipy.optimize")
         self._prior = self.parameters.copy()
 
     def take(self, rows: Rows) -> list[tuple[int, HeaveModel, dict[int, Array]]]:
         """Take rows that are final, in order; return for each fit that came due its time, the heave's model and the
-        chains that change: by their first place in ``parameters``, their parameters from then on (7,) with the place's
-        random walk behind them (8,).
+        chains that change: by their first place in ``parameters``, their parameters from then on (7,) with the speed
+        of the place's drift behind them (8,).
         """
         every = int(self.every_s * 1e9)
         seen = (rows.kind == Kind.VISION) & (rows.outcome <= Outcome.DOWNWEIGHTED) & (rows.seen[:, 1] > 0.0)
@@ -99,13 +103,13 @@ class MotionLearner:
             at = stop
             model = self._fit()
             if model is not None:
-                walk = self.parameters[OFFSET_WALK]
+                drift = self.parameters[DRIFT_SPEED]
                 changed = sorted({HEAVE, *self._changed})
                 results.append(
                     (
                         self._due_ns,
                         model,
-                        {c: np.array([*self.parameters[c : c + BAND_PARAMETERS], walk]) for c in changed},
+                        {c: np.array([*self.parameters[c : c + BAND_PARAMETERS], drift]) for c in changed},
                     )
                 )
                 self._changed.clear()
@@ -157,20 +161,25 @@ class MotionLearner:
         self.model = fit(t[now], height, sigma, window_s=self.window_s, previous=self.model)
         if self.model.method == "bhr":
             self._take(HEAVE, self.model)
-        if t[-1] - t[0] >= SWAY_S:
-            axis = self._count % SWAY_EVERY
-            if axis < len(self.sway):
-                place, sigma = seen[:, 2 + 2 * axis], np.sqrt(seen[:, 3 + 2 * axis])
-                mean, moved = self._drift(seen[:, 10 + axis]), seen[:, 7 + axis]
-                swing = place - mean + fast_part(t, mean - moved)
-                model = fit(t, swing, sigma, window_s=self.window_s, previous=self.sway[axis])
-                self.sway[axis] = model
-                if model.learned is not None:
-                    self._take(CHAINS[1 + axis], model)
-                self._walks[axis] = min(_walk(t, place), _walk(t, place - moved))
-                self.parameters[OFFSET_WALK] = max(float(self._prior[OFFSET_WALK]), *self._walks)
-            self._count += 1
+        axis = self._count % SWAY_EVERY
+        self._count += 1
+        if axis < len(self.sway):
+            place, sigma = seen[:, 2 + 2 * axis], np.sqrt(seen[:, 3 + 2 * axis])
+            mean, moved = self._drift(seen[:, 10 + axis]), seen[:, 7 + axis]
+            swing = place - mean + fast_part(t, mean - moved)
+            model = fit(t, swing, sigma, window_s=self.window_s, previous=self.sway[axis])
+            self.sway[axis] = model
+            if model.learned is not None:
+                self._take(CHAINS[1 + axis], model)
+            self._drifts[axis] = drift_velocity(t, place)
+            self.parameters[DRIFT_SPEED] = self._drift_speed()
         return self.model
+
+    def _drift_speed(self) -> float:
+        """Return the 1-sigma [m/s] of the drift's velocity: what was seen of it, and the prior in its weight."""
+        seen = np.concatenate(self._drifts)
+        square = DRIFT_PRIOR * float(self._prior[DRIFT_SPEED]) ** 2 + float(seen @ seen) / DRIFT_SEEN
+        return math.sqrt(square / (DRIFT_PRIOR + len(seen)))
 
     def _take(self, chain: int, model: HeaveModel) -> None:
         """Take a chain's form from a model where the model foresees the motion, else its size and speed."""
@@ -228,13 +237,10 @@ def broad_motion(sigma_m: float, rate_mps: float, damping: float) -> Array:
     return any_sea(sigma, min(max(omega, SEA_RADPS[0]), SEA_RADPS[1]), damping)
 
 
-def _walk(t_s: Array, place_m: Array) -> float:
-    """Return the random walk [m/rts] that stands for how the place (n,) drifts from one mean to the next."""
+def drift_velocity(t_s: Array, place_m: Array) -> Array:
+    """Return the velocities (k,) [m/s] with which the mean of a place (n,) moves from ``SLOW_S`` to ``SLOW_S``."""
     block = np.floor((t_s - t_s[-1]) / SLOW_S).astype(int)
     means = [
         float(place_m[block == k].mean()) for k in np.unique(block) if np.ptp(t_s[block == k]) > 0.8 * SLOW_S
     ]
-    if len(means) < 2:
-        return 0.0
-    velocity = np.diff(means) / SLOW_S
-    return math.sqrt(float(np.mean(velocity**2)) * DRIFT_TIME_S)
+    return np.asarray(np.diff(means) / SLOW_S)

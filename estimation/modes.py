@@ -100,7 +100,7 @@ class Progress:
     the begin of the last descent (None: not yet), ``station_ns`` the arrival over the anchor, ``attempts`` the aborts.
     ``rate_power_m2ps2`` is the mean square of the deck's rate over the ``rate_count`` steps of the observation.
     ``losses`` counts how often the target was lost again before a landing.
-    ``drift_mps`` north and east is how fast the place drifts that is to be kept, ``stepped_ns`` when that was last
+    ``drift_mps`` north and east is added against an error that lasts, ``stepped_ns`` when that was last
     corrected.
     """
 

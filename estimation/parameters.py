@@ -78,6 +78,7 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     LATENCY_WALK,
     LATENCY_RATE,
     LATENCY,
+    OFFSET_WALK,
     LEVEL_WALK,
     PRIOR_HEAVE,
     _,
@@ -87,7 +88,7 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     _,
     _,
     SIZE,
-) = range(73)
+) = range(74)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +140,7 @@ def pack_parameters(config: Config, site: Site) -> Array:
     mount = quat_to_matrix(euler_to_quat(*v.mount_rpy_rad))
     p[VISION_MOUNT : VISION_MOUNT + 9] = (R_CB_NOMINAL @ mount.T).ravel()
     p[LATENCY_WALK], p[LATENCY_RATE], p[LATENCY] = v.latency_walk, v.latency_rate_radps, v.latency_s
+    p[OFFSET_WALK] = d.offset_walk
     p[LEVEL_WALK] = d.level_walk
     if d.use is True:
         from estimation.deck import prior_motion

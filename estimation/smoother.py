@@ -25,7 +25,7 @@ import numpy as np
 from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
-from estimation.deck import add_drift, deck_output
+from estimation.deck import deck_output
 from estimation.frames import Array
 from estimation.models import inverse_right_jacobian, right_jacobian
 from estimation.rows import Estimates, FilterState, Rows
@@ -218,4 +218,3 @@ def _write(out: Estimates, k: int, t_ns: int, s: Smoothed, motion: Array, layout
     if out.deck.shape[1]:
         out.deck[k], A = deck_output(s.x, motion, layout.offsets, layout.size)
         out.deck_covariance[k] = A @ s.P @ A.T
-        add_drift(motion, out.deck_covariance[k])

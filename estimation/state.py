@@ -29,13 +29,14 @@ Offsets = NDArray[np.int64]
     GPS_BIAS,
     BARO_BIAS,
     PLATFORM_OFFSET,
+    PLATFORM_DRIFT,
     PLATFORM_SWAY,
     PLATFORM_LEVEL,
     PLATFORM_HEAVE,
     RANGE_SCALE,
     CAMERA_LATENCY,
     CAMERA_MOUNT,
-) = range(14)
+) = range(15)
 
 BLOCKS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("position", ("n", "e", "d"), "m"),
@@ -46,6 +47,7 @@ BLOCKS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("gps_bias", ("n", "e", "d"), "m"),
     ("baro_bias", ("h",), "m"),
     ("platform_offset", ("n", "e"), "m"),
+    ("platform_drift", ("n", "e"), "m/s"),
     (
         "platform_sway",
         (
@@ -69,10 +71,11 @@ NOMINAL_SIZE = sum(SIZES) + 1
 
 P0, V0, Q0, BG0, BA0, BP0, BB0 = (NOMINAL[b] for b in range(7))
 """First places in the nominal state of position, velocity, attitude, biases of gyro, accelerometer, GPS, baro."""
-PO0, PS0, PL0, PH0, RS0, CL0, CM0 = (NOMINAL[b] for b in range(7, 14))
-"""First places of the platform's offset, sway, level and heave, of range scale, camera latency and mount."""
+PO0, PD0, PS0, PL0, PH0, RS0, CL0, CM0 = (NOMINAL[b] for b in range(7, 15))
+"""First places of the platform's offset, drift, sway, level and heave, of range scale, camera latency and mount."""
 DECK_BLOCKS = (
     PLATFORM_OFFSET,
+    PLATFORM_DRIFT,
     PLATFORM_SWAY,
     PLATFORM_LEVEL,
     PLATFORM_HEAVE,

@@ -13,11 +13,12 @@ from estimation.config import parse_config
 from estimation.deck import deck_transition
 from estimation.estimator import LandingEstimator
 from estimation.parameters import Site, pack_parameters
-from estimation.state import PH0, PS0, Layout, nominal_zero
+from estimation.state import PD0, PH0, PS0, Layout, nominal_zero
 from simulation.flight import load_scenario, simulate
 
 HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4])
 NORTH, EAST = np.array([0.4, 1.1, 1.2, 2.0, 0.1, 0.2, 0.4]), np.array([0.7, 0.9, 1.6, 1.9, 0.2, 0.3, 0.3])
+DRIFT = np.array([0.15, -0.08])
 SWAY = 0.2 * np.random.default_rng(5).normal(size=12)
 
 
@@ -40,7 +41,8 @@ def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
     x, covariance = nominal_zero(), P.copy()
     x[PH0 : PH0 + 6] = x6
     x[PS0 : PS0 + 12] = SWAY
-    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x6, P, MOTION, True, SWAY)
+    x[PD0 : PD0 + 2] = DRIFT
+    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x6, P, MOTION, True, SWAY, DRIFT)
     for _ in range(160):
         F, Q = np.eye(layout.size), np.zeros((layout.size, layout.size))
         y = x.copy()
@@ -54,14 +56,15 @@ def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
     for axis, band in enumerate((NORTH, EAST)):
         swing, at = band_matrix(band)[5], PS0 + 6 * axis
         assert forecast.sway_mps[:, axis] == pytest.approx(
-            [swing @ SWAY[6 * axis : 6 * axis + 6], swing @ x[at : at + 6]], abs=1e-6
+            [swing @ SWAY[6 * axis : 6 * axis + 6] + DRIFT[axis], swing @ x[at : at + 6] + x[PD0 + axis]],
+            abs=1e-6,
         )
     assert forecast.height_sigma_m[1] == pytest.approx(math.sqrt(covariance[5, 5]), rel=1e-3)
 
 
 def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
     x6, P = some_heave()
-    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x6, 1e3 * P, MOTION, False, SWAY)
+    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x6, 1e3 * P, MOTION, False, SWAY, DRIFT)
     sea = band_stationary(HEAVE)
     rate = band_matrix(HEAVE)[5]
     assert forecast.sea_rate_sigma_mps == pytest.approx(math.sqrt(rate @ sea @ rate))
@@ -73,7 +76,7 @@ def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
 
 def test_the_probability_of_quiet_is_that_of_the_worst_moment() -> None:
     x6, P = some_heave()
-    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x6, P, MOTION, True, SWAY)
+    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x6, P, MOTION, True, SWAY, DRIFT)
     chance = forecast.quiet_probability(0.5, 1.5, 0.3)
     rng = np.random.default_rng(1)
     inside = (forecast.horizon_s >= 0.5) & (forecast.horizon_s <= 1.5)

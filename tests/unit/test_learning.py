@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from estimation.band import band_moments
 from estimation.config import PlatformConfig
-from estimation.deck import DRIFT_TIME_S, HEAVE, OFFSET_WALK, SWAY_EAST, SWAY_NORTH, prior_motion
+from estimation.deck import DRIFT_SPEED, DRIFT_TIME_S, HEAVE, SWAY_EAST, SWAY_NORTH, prior_motion
 from estimation.events import Kind
-from estimation.learning import MotionLearner
+from estimation.learning import DRIFT_PRIOR, DRIFT_SEEN, MotionLearner, drift_velocity
 from estimation.outcome import Outcome
 from estimation.rows import Rows
 from estimation.watch import LET_GO
@@ -81,15 +81,36 @@ def test_steps_of_the_vehicles_own_place_are_no_sea_and_its_drift_is_none_of_the
     # Nothing but what the noise may hide: a rate of 0.055 m/s; steps taken as they look would be three times the size.
     assert told(one.parameters, SWAY_EAST)[0] < 0.02 and told(one.parameters, SWAY_EAST)[1] < 0.06
     assert told(one.parameters, HEAVE)[0] < 0.04
-    assert one.parameters[OFFSET_WALK] < 0.06
+    assert one.parameters[DRIFT_SPEED] < 0.75 * PlatformConfig().drift_sigma_mps
 
 
-def test_the_drift_of_the_place_is_learned_as_a_random_walk() -> None:
+def drifting(n: int, sigma_mps: float, rng: np.random.Generator) -> Array:
+    """Return a place (n,) whose velocity is the filter's Gauss-Markov process."""
+    remains = math.exp(-1.0 / RATE_HZ / DRIFT_TIME_S)
+    velocity = np.empty(n)
+    velocity[0] = sigma_mps * rng.standard_normal()
+    for k in range(1, n):
+        velocity[k] = (
+            remains * velocity[k - 1] + sigma_mps * math.sqrt(1.0 - remains**2) * rng.standard_normal()
+        )
+    return np.asarray(np.cumsum(velocity) / RATE_HZ)
+
+
+def test_the_speed_of_the_drift_is_learned_from_its_place_and_not_from_its_sway() -> None:
+    """Over many flights the velocities between means have the share of its variance that is reckoned with, and a flight
+    tells as much as it has seen, the prior the rest."""
     rng = np.random.default_rng(5)
     t = np.arange(0.0, 58.0, 1.0 / RATE_HZ)
-    one = learner()
-    one.take(seen(0.0 * t, 0.1 * t, sea(t, 0.2, 6.0, rng), rng))
-    assert one.parameters[OFFSET_WALK] == pytest.approx(0.1 * math.sqrt(DRIFT_TIME_S), rel=0.1)
+    squares = [np.mean(drift_velocity(t, drifting(len(t), 0.1, rng)) ** 2) for _ in range(600)]
+    assert np.mean(squares) == pytest.approx(DRIFT_SEEN * 0.1**2, rel=0.08)
+
+    prior = PlatformConfig().drift_sigma_mps
+    still, steady = learner(), learner()
+    still.take(seen(0.0 * t, sea(t, 0.1, 4.0, rng), sea(t, 0.2, 6.0, rng), rng))
+    steady.take(seen(0.0 * t, 0.2 * t, sea(t, 0.2, 6.0, rng), rng))
+    assert 0.5 * prior < still.parameters[DRIFT_SPEED] < 0.75 * prior
+    expected = math.sqrt((DRIFT_PRIOR * prior**2 + 3 * 0.2**2 / DRIFT_SEEN) / (DRIFT_PRIOR + 6))
+    assert steady.parameters[DRIFT_SPEED] == pytest.approx(expected, rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(4))
