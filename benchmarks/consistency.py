@@ -3,9 +3,10 @@
     python benchmarks/consistency.py [--full] [--flights 10] [--scenario NAME ...] [--first-seed 1000] [--jobs 1]
                                      [--json FILE] [--no-gate]
 
-Two scenarios without vision, and landings on a raft in Beaufort 1, 2 and 3, with swell, and while GPS wanders by
-metres: search without vision (climb, cruise), tracking (the first 12 s in sight), observation (hover), a loss of vision
-of 5 s (blind), final descent. ``--full`` flies 50 of each. Sensors are drawn from what the filter is told.
+Two scenarios without vision, and landings by plan on a raft in Beaufort 1, 2 and 3, with swell, and while GPS wanders
+by metres: search without vision (climb, cruise), tracking (the first 12 s in sight), observation (hover), a loss of
+vision of 5 s (blind), final descent. Then landings that were flown on their own estimates, following the deck, mode by
+mode. ``--full`` flies 50 of each. Sensors are drawn from what the filter is told.
 
 Printed are means over the degrees of freedom; 1 is honest, above it the filter trusts itself too much, below too
 little. A star marks a mean outside the 95 % band for so many runs; of many honest means some fall outside by chance, so
@@ -24,8 +25,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from joblib import Parallel, delayed
+from landings import MISSION, SEAS
 from targets import Target, Targets, provenance
 
 from deckfix.deck_reference import true_height
@@ -33,7 +36,8 @@ from deckfix.forecasts import WIDTH_95, forecasts
 from deckfix.reference import Trajectory, column
 from estimation.consistency import RunsConsistency
 from simulation.flight import load_scenario
-from simulation.montecarlo import PARTS, FlightErrors, fly, nees_by_phase, nis_by_phase
+from simulation.mission import load_mission
+from simulation.montecarlo import FlightErrors, fly, land, nees_by_phase, nis_by_phase
 
 SCENARIOS = (
     "consistency_default_2026_06",
@@ -44,21 +48,31 @@ SCENARIOS = (
     "consistency_swell_2026_11",
     "consistency_wander_2026_11",
 )
+LANDINGS = {
+    "landing_beaufort2": "Beaufort 2",
+    "landing_beaufort3": "Beaufort 3",
+    "landing_swell": "Beaufort 3 + swell",
+}
 QUICK, FULL = 10, 50
 HORIZONS_S = (0.5, 1.0, 2.0, 3.0, 5.0)
 COVERAGE = (0.92, 0.98)
 
 
-def rows(result: dict[tuple[str, str], RunsConsistency]) -> list[str]:
+def width(part: str) -> int:
+    """Return the width of a part's column."""
+    return max(8, len(part) + 1)
+
+
+def rows(result: dict[tuple[str, str], RunsConsistency], parts: Sequence[str]) -> list[str]:
     lines = []
     for name in dict.fromkeys(name for name, _ in result):
-        known = {phase: result[name, phase] for phase in PARTS if (name, phase) in result}
+        known = {phase: result[name, phase] for phase in parts if (name, phase) in result}
         band = next(iter(known.values())).band
         cells = [
-            f"{known[p].mean_over_dof:7.2f}{' ' if known[p].consistent else '*'}"
+            f"{known[p].mean_over_dof:{width(p) - 1}.2f}{' ' if known[p].consistent else '*'}"
             if p in known
-            else "       -"
-            for p in PARTS
+            else f"{'-':>{width(p)}s}"
+            for p in parts
         ]
         lines.append(f"{name:14s} {band.low:5.2f} to {band.high:4.2f} " + "".join(cells))
     return lines
@@ -71,6 +85,18 @@ def numbers(result: dict[tuple[str, str], RunsConsistency]) -> dict[str, dict[st
     return out
 
 
+def flown(name: str, seeds: Sequence[int], jobs: int) -> tuple[list[FlightErrors], str]:
+    """Return the flights of a scenario, by plan or on their own estimates, and what it is."""
+    if name in LANDINGS:
+        mission = msgspec.structs.replace(load_mission(MISSION), sea=SEAS[LANDINGS[name]])
+        work = [delayed(land)(mission, seed) for seed in seeds]
+        description = f"Search to contact on its own estimates in {LANDINGS[name]}"
+    else:
+        scenario = load_scenario(name)
+        work, description = [delayed(fly)(scenario, seed) for seed in seeds], scenario.description
+    return Parallel(jobs)(work), description
+
+
 def coverage(flights: Sequence[FlightErrors]) -> list[dict[str, Any]]:
     """Return how many of all flights' forecasts hold the true height, by horizon; nothing where none were made."""
     held: list[np.ndarray] = []
@@ -78,13 +104,9 @@ def coverage(flights: Sequence[FlightErrors]) -> list[dict[str, Any]]:
     for f in flights:
         if not f.run.heave:
             continue
-        t = f.run.t_ns
-        deck = f.flight.trajectory.platform.motion(f.flight.clock.true_s(t)).position[0]
-        happened = true_height(f.run, Trajectory(column(t, deck), None, None))
+        happened = true_height(f.run, Trajectory(column(f.run.t_ns, f.known.deck_m), None, None))
         assert happened is not None
-        end_ns = t[-1] - int(
-            1e9 * (f.flight.trajectory.plan.duration_s - f.flight.trajectory.plan.touchdown_s)
-        )
+        end_ns = int(f.known.clock.stamp_ns(np.array([f.known.contact_s]))[0])
         made = forecasts([(due, m) for due, m in f.run.heave if due < end_ns], HORIZONS_S)
         at = made.origin_ns[:, None] + np.round(made.horizon_s * 1e9).astype(np.int64)
         seen = happened.at(at.ravel())[:, 0].reshape(at.shape)
@@ -110,7 +132,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--full", action="store_true", help="as many flights as the targets ask for")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS))
+    parser.add_argument("--scenario", nargs="+", default=[*SCENARIOS, *LANDINGS])
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--no-gate", action="store_true", help="exit with 0 in any case")
     arguments = parser.parse_args()
@@ -118,18 +140,18 @@ def main() -> None:
     document: dict[str, object] = {"benchmark": "consistency", **provenance(), "flights": count}
     targets = Targets()
     for name in arguments.scenario:
-        scenario = load_scenario(name)
         begin = time.perf_counter()
-        flights = Parallel(arguments.jobs)(
-            delayed(fly)(scenario, arguments.first_seed + k) for k in range(count)
+        flights, description = flown(
+            name, range(arguments.first_seed, arguments.first_seed + count), arguments.jobs
         )
         wall = time.perf_counter() - begin
-        print(f"\n{name}: {scenario.description}; {len(flights)} flights in {wall:.0f} s")
+        print(f"\n{name}: {description}; {len(flights)} flights in {wall:.0f} s")
         nees, nis = nees_by_phase(flights), nis_by_phase(flights)
-        heading = "".join(f"{phase:>8s}" for phase in PARTS)
+        parts = flights[0].known.parts
+        heading = "".join(f"{part:>{width(part)}s}" for part in parts)
         for title, result in (("NEES / dof", nees), ("NIS / dof", nis)):
             print(f"{title:14s} band          {heading}")
-            print("\n".join(rows(result)))
+            print("\n".join(rows(result, parts)))
         judged = [*nees.values(), *nis.values()]
         inside = sum(c.consistent for c in judged)
         print(f"{inside} of {len(judged)} means inside their 95 % band")

@@ -44,6 +44,7 @@ from estimation.config import Config
 from estimation.estimator import LandingEstimator
 from estimation.output import Run
 from simulation.flight import Scenario, SimulatedFlight, load_scenario, simulate
+from simulation.known import known_of_flight
 from simulation.montecarlo import FlightErrors, errors, kinematic_errors, nees_by_phase
 from simulation.trajectory import PHASES
 
@@ -104,12 +105,16 @@ def one(name: str, seed: int, deck: bool) -> Smoothed:
             squares[label] = _pair([getattr(e, attribute)[w.inside(e.t_ns)] for e, w in pair])
         return Smoothed(squares, None)
     first = run.t_ns[0]
-    kept = [kinematic_errors(flight, r)[0][r.t_ns >= first] for r in (run, smoothed)]
+    known = known_of_flight(flight, smoothed)
+    kept = [
+        kinematic_errors(r, k)[0][r.t_ns >= first]
+        for r, k in ((run, known_of_flight(flight, run)), (smoothed, known))
+    ]
     for label, part in QUANTITIES.items():
         squares[label] = _pair(
             [e[:, part] - (e[:, part].mean(axis=0) if part.start == 0 else 0.0) for e in kept]
         )
-    return Smoothed(squares, errors(flight, smoothed))
+    return Smoothed(squares, errors(smoothed, known))
 
 
 def _pair(both: Sequence[Array]) -> tuple[float, float]:

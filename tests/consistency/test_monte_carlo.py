@@ -7,7 +7,9 @@ import pytest
 
 from estimation.consistency import RunsConsistency, whiteness
 from simulation.flight import load_scenario
-from simulation.montecarlo import FlightErrors, fly, nees_by_phase, nis_by_phase
+from simulation.known import MODE_PARTS
+from simulation.mission import load_mission
+from simulation.montecarlo import FlightErrors, fly, land, nees_by_phase, nis_by_phase
 from simulation.trajectory import PHASES
 
 SCENARIOS = ("consistency_default_2026_06", "consistency_survey_2026_06")
@@ -57,9 +59,24 @@ def test_innovations_are_white(flights: list[FlightErrors]) -> None:
             r = flight.run.records[flight.run.records["sensor"] == flight.run.sensors.index(name)]
             r = r[r["dof"] > 0]
             rho.append(whiteness(r["innovation"][:, 0] / r["sigma"][:, 0], lags=10).autocorrelation)
-        n = min(len(f.nis[name][1]) for f in flights) * len(flights)
+        n = min(len(f.nis[name].values) for f in flights) * len(flights)
         # Four sigma: 2 scenarios, 3 sensors and 10 lags are looked at.
         assert np.abs(np.mean(rho, axis=0)).max() < 4.0 / np.sqrt(n), name
+
+
+def test_following_a_deck_that_drifts_leaves_the_estimates_as_good_as_they_say() -> None:
+    """A landing flown on its own estimates: what the vehicle does depends on their errors, which a plan's flight hides.
+
+    The raft drifts by up to 0.2 m/s on its mooring, and the vehicle with it, so that the fixes show neither.
+    """
+    flights = [land(load_mission("landing_beaufort2_2026_11"), 7000 + seed) for seed in range(QUICK)]
+    nees, nis = nees_by_phase(flights, 0.999), nis_by_phase(flights, 0.999)
+    assert {part for _, part in nees} >= set(MODE_PARTS) - {"abort"}
+    assert {name for name, _ in nees} >= {"velocity", "attitude", "accel_bias", "relative", "deck_rate"}
+    assert not table(nees), table(nees)
+    assert not table(nis), table(nis)
+    truth = np.concatenate([f.known.deck_mps[:, :2] for f in flights])
+    assert np.abs(truth).max() > 0.15
 
 
 @pytest.mark.nightly

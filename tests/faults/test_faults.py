@@ -15,6 +15,7 @@ from estimation.outcome import Outcome
 from estimation.output import Run
 from simulation import faults
 from simulation.flight import SimulatedFlight, load_scenario, simulate
+from simulation.known import known_of_flight
 from simulation.montecarlo import kinematic_errors
 
 Replay = Callable[[EventBatch], "Judged"]
@@ -52,7 +53,7 @@ def replay(flight: SimulatedFlight) -> Replay:
         if not len(run.t_ns):
             nothing = np.empty(0)
             return Judged(run, nothing, np.empty((0, 3)), np.empty((0, 3)), nothing, nothing)
-        e, _ = kinematic_errors(flight, run)
+        e, _ = kinematic_errors(run, known_of_flight(flight, run))
         degrees = np.degrees(e[:, 6:9])
         tilt = np.linalg.norm(degrees[:, :2], axis=1)
         return Judged(run, flight.clock.true_s(run.t_ns), e[:, :3], e[:, 3:6], tilt, np.abs(degrees[:, 2]))
