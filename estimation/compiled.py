@@ -1,24 +1,18 @@
 """The compiled engine: the reference engine's loop in one numba kernel, over the same model functions.
 
-The model functions stay plain Python; numba compiles them when the kernel is first called and caches the machine
-code under the user's cache folder, keyed by the sources, so that an edit is never met by stale code.
+The model functions stay plain Python; numba compiles them (``estimation.overloads``) when the kernel is first called and
+caches the machine code under the user's cache folder, keyed by the sources, so that an edit is never met by stale code.
 """
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numba.extending import overload, register_jitable
+from numba.extending import register_jitable
 
-from estimation import algebra, band, deck, frames, models, parameters, state, update, watch
-from estimation import relinearise as relinearisation
-from estimation import rows as rows_module
-from estimation import trail as trail_module
 from estimation.algebra import (
     congruence,
     corrected,
@@ -36,6 +30,7 @@ from estimation.deck import HEAVE, deck_output, seen_place, take_up
 from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
 from estimation.outcome import Outcome
+from estimation.overloads import SOURCES
 from estimation.relinearise import moved_far, relinearise
 from estimation.rows import (
     HEAVE_MODEL,
@@ -90,135 +85,63 @@ _REJECTED_GATE = int(Outcome.REJECTED_GATE)
 _IMU = 0
 
 
-@overload(frames.compose)
-def _compose(a: Array, b: Array) -> Callable[[Array, Array], Array]:
-    """Compile the small product as loops."""
-
-    def product(a: Array, b: Array) -> Array:
-        c = np.empty((3, 3))
-        for i in range(3):
-            for j in range(3):
-                c[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
-        return c
-
-    return product
-
-
-@overload(frames.rotate)
-def _rotate(m: Array, v: Array) -> Callable[[Array, Array], Array]:
-    """Compile the small product as loops."""
-
-    def product(m: Array, v: Array) -> Array:
-        u = np.empty(3)
-        for i in range(3):
-            u[i] = m[i, 0] * v[0] + m[i, 1] * v[1] + m[i, 2] * v[2]
-        return u
-
-    return product
-
-
-@overload(band.product)
-def _band_product(T: Array, v: Array) -> Callable[[Array, Array], Array]:
-    """Compile the product with a small matrix as loops."""
-    if v.ndim == 1:
-
-        def by_vector(T: Array, v: Array) -> Array:
-            n = T.shape[0]
-            out = np.zeros(n)
-            for i in range(n):
-                for k in range(n):
-                    out[i] += T[i, k] * v[k]
-            return out
-
-        return by_vector
-
-    def by_matrix(T: Array, v: Array) -> Array:
-        n, m = v.shape
-        out = np.zeros((n, m))
-        for i in range(n):
-            for k in range(n):
-                for j in range(m):
-                    out[i, j] += T[i, k] * v[k, j]
-        return out
-
-    return by_matrix
-
-
-@overload(models.put)
-def _put(target: Array, row: int, column: int, scale: float, block: Array) -> Callable[..., None]:
-    """Compile the small assignment as loops, without a product in between."""
-
-    def assign(target: Array, row: int, column: int, scale: float, block: Array) -> None:
-        for i in range(3):
-            for j in range(3):
-                target[row + i, column + j] = scale * block[i, j]
-
-    return assign
-
-
-for _module in (algebra, band, deck, frames, models, relinearisation, state, update, watch):
-    for _function in vars(_module).values():
-        if (
-            inspect.isfunction(_function)
-            and _function.__module__ == _module.__name__
-            and _function
-            not in (
-                frames.compose,
-                frames.rotate,
-                models.put,
-                band.band_stationary,
-                band.product,
-                deck.any_sea,
-                deck.prior_motion,
-            )
-        ):
-            register_jitable(_function)
-
-
 def _transited(F: Array, P: Array, span: Int) -> Array:
     """Return F P, using that F is the identity but for the nine columns of attitude and biases, the velocity in the
-    position, and the spans of ``_spans`` behind."""
+    position, and the spans of ``_spans`` behind. Sums are written out: a row is then gone through once.
+    """
     n = P.shape[0]
-    dt = F[0, 3]
     FP = np.empty((n, n))
-    for i in range(9):
+    for i in range(6):
+        dt = F[0, 3] if i < 3 else 0.0
+        a, b, c = F[i, 6], F[i, 7], F[i, 8]
+        d, e, f = F[i, 9], F[i, 10], F[i, 11]
+        g, h, k = F[i, 12], F[i, 13], F[i, 14]
         for j in range(n):
-            FP[i, j] = 0.0 if i >= 6 else P[i, j]
-        if i < 3:
-            for j in range(n):
-                FP[i, j] += dt * P[i + 3, j]
-        for k in range(6, 15 if i < 6 else 12):
-            f = F[i, k]
-            for j in range(n):
-                FP[i, j] += f * P[k, j]
+            FP[i, j] = (
+                P[i, j] + dt * P[i + 3, j]
+                + a * P[6, j] + b * P[7, j] + c * P[8, j]
+                + d * P[9, j] + e * P[10, j] + f * P[11, j]
+                + g * P[12, j] + h * P[13, j] + k * P[14, j]
+            )  # fmt: skip
+    for i in range(6, 9):
+        _six_rows(FP, F, P, i, 6)
     for i in range(9, n):
+        first = span[i, 0]
+        if span[i, 1] - first == BAND_SIZE:
+            _six_rows(FP, F, P, i, first)
+            continue
         for j in range(n):
-            FP[i, j] = 0.0
-        for k in range(span[i, 0], span[i, 1]):
-            f = F[i, k]
+            FP[i, j] = F[i, first] * P[first, j]
+        for q in range(first + 1, span[i, 1]):
             for j in range(n):
-                FP[i, j] += f * P[k, j]
+                FP[i, j] += F[i, q] * P[q, j]
     return FP
 
 
+@register_jitable
+def _six_rows(out: Array, F: Array, P: Array, i: int, first: int) -> None:
+    """Write row i of F P where F has entries in six columns from the first on."""
+    a, b, c = F[i, first], F[i, first + 1], F[i, first + 2]
+    d, e, f = F[i, first + 3], F[i, first + 4], F[i, first + 5]
+    for j in range(P.shape[1]):
+        out[i, j] = (
+            a * P[first, j] + b * P[first + 1, j] + c * P[first + 2, j]
+            + d * P[first + 3, j] + e * P[first + 4, j] + f * P[first + 5, j]
+        )  # fmt: skip
+
+
 def _propagate_covariance(P: Array, F: Array, Q: Array, span: Int) -> None:
-    """Replace P by F P F' + Q, with F as in ``_transited``."""
+    """Replace P by F (F P)' + Q, with F as in ``_transited``: its loops run along rows, and it is F P F'."""
     n = P.shape[0]
-    dt = F[0, 3]
     FP = _transited(F, P, span)
+    turned = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            turned[j, i] = FP[i, j]
+    FPF = _transited(F, turned, span)
     for i in range(n):
         for j in range(i + 1):
-            if j >= 9:
-                value = 0.0
-                for k in range(span[j, 0], span[j, 1]):
-                    value += FP[i, k] * F[j, k]
-            else:
-                value = 0.0 if j >= 6 else FP[i, j]
-                if j < 3:
-                    value += dt * FP[i, j + 3]
-                for k in range(6, 15 if j < 6 else 12):
-                    value += FP[i, k] * F[j, k]
-            value += Q[i, j]
+            value = FPF[j, i] + Q[i, j]
             P[i, j] = value
             P[j, i] = value
 
@@ -439,20 +362,7 @@ def _advance(
     return count
 
 
-_SOURCES = (
-    algebra,
-    deck,
-    frames,
-    models,
-    parameters,
-    relinearisation,
-    rows_module,
-    state,
-    trail_module,
-    update,
-    watch,
-)
-_kernel = jitted(_advance, [Path(inspect.getfile(m)) for m in _SOURCES] + [Path(__file__)])
+_kernel = jitted(_advance, [*SOURCES, Path(__file__)])
 
 
 @dataclass(slots=True)
