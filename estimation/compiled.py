@@ -1,7 +1,7 @@
 """The compiled engine: the reference engine's loop in one numba kernel, over the same model functions.
 
-The model functions stay plain Python; numba compiles them (``estimation.overloads``) when the kernel is first called and
-caches the machine code under the user's cache folder, keyed by the sources, so that an edit is never met by stale code.
+The model functions stay plain Python; numba compiles them (``estimation.overloads``) when the kernel is first called,
+and caches the machine code under the user's cache folder, keyed by the sources: an edit never meets stale code.
 """
 
 from __future__ import annotations
