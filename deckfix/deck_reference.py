@@ -126,14 +126,12 @@ def fused_fixes_ns(run: Run) -> Times:
 
 
 def height_seen_later(run: Run, reach_s: float = 0.5) -> Column | None:
-    """Return the estimated height of the deck (up), where a fix was fused within ``reach_s``; NaN-free."""
+    """Return the estimated height of the deck (up), where a fix was fused in the ``reach_s`` before; NaN-free."""
     times = fused_fixes_ns(run)
     if not len(times) or not run.deck.shape[1]:
         return None
-    after = np.searchsorted(times, run.t_ns).clip(0, len(times) - 1)
-    before = (after - 1).clip(0)
-    near = np.minimum(np.abs(times[after] - run.t_ns), np.abs(run.t_ns - times[before]))
-    seen = near <= reach_s * 1e9
+    last = np.searchsorted(times, run.t_ns, side="right") - 1
+    seen = (last >= 0) & (run.t_ns - times[last.clip(0)] <= reach_s * 1e9)
     return column(run.t_ns[seen], run.deck[seen, 6:7])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from small_flight import BOOT, COMPANION_AHEAD_NS, HEAVE_M, HEAVE_S, deck_down_m
 
 import deckfix
 from deckfix.commands import finite
-from deckfix.deck_reference import slow
+from deckfix.deck_reference import fused_fixes_ns, height_seen_later, slow
 from deckfix.forecasts import HORIZONS_S, Forecasts, judge
 from deckfix.reference import Column
 from deckfix.result import Result
@@ -50,6 +51,16 @@ def test_relative_position_and_heave_are_judged_against_the_truth(result: Result
     assert result.deck_errors is not None
     first = result.deck_errors.judged.start_ns
     assert result.seconds(first) == pytest.approx(result.t_s[0] + 5.0, abs=0.5)
+
+
+def test_the_height_that_was_seen_begins_with_the_first_fix(result: Result) -> None:
+    """Before it the height is the prior's: a sample of it beside the others is no heave."""
+    records = result.run.records
+    run = replace(result.run, records=records[records["t_ns"] > result.run.t_ns[0] + 3_000_000_000])
+    height, fixes = height_seen_later(run), fused_fixes_ns(run)
+    assert height is not None and fixes[0] > run.t_ns[0] + 3_000_000_000
+    assert height.t_ns[0] == run.t_ns[np.searchsorted(run.t_ns, fixes[0])]
+    assert np.all(np.isin(run.t_ns[run.t_ns > fixes[0]], height.t_ns))
 
 
 def test_raw_fixes_are_shown_in_the_same_frame(result: Result) -> None:
