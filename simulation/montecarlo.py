@@ -90,8 +90,6 @@ def errors(run: Run, known: Known) -> FlightErrors:
     usable = (index < len(true_s)) & (grid >= true_s[0])
     # An instant is the first estimate after it; before the start there is none.
     chosen = index[usable]
-    instants = np.full(len(grid), np.nan)
-    instants[usable] = true_s[chosen]
 
     def at_instants(dof: int, squares: Array) -> Squares:
         values = np.full(len(grid), np.nan)
