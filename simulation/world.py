@@ -308,7 +308,8 @@ class World:
         share = min(1.0, max(0.0, at - k))
         row = self._truth[k]
         after = self._truth[k + 1] if k + 1 < STEPS else np.concatenate([self._x[:13], row[13:]])
-        mixed = row + share * (after - row) if share > 1e-6 else row
+        # Never a view: a picture of this moment is exposed while the vehicle goes on.
+        mixed = row + share * (after - row) if share > 1e-6 else row.copy()
         deck = self._deck[k] + share * (self._deck[k + 1] - self._deck[k])
         q = mixed[6:10] / np.linalg.norm(mixed[6:10])
         return Instant(

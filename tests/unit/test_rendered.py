@@ -84,6 +84,14 @@ def test_the_target_is_found_in_the_pictures_where_it_is(done: tuple[Flown, Comp
     assert error.max() < 0.02
 
 
+def test_a_flight_is_the_same_again(done: tuple[Flown, Companion]) -> None:
+    """The pictures are exposed beside the flight: what they show must not depend on which of both is faster."""
+    flown, companion = done
+    again, other = fly_rendered(parse_mission(MISSION), 1, engine="filterpy")
+    assert again.batch.rows.tobytes() == flown.batch.rows.tobytes()
+    assert [one.image for one in other.kept] == [one.image for one in companion.kept]
+
+
 def test_the_vehicle_is_led_by_them(done: tuple[Flown, Companion]) -> None:
     flown, _ = done
     assert flown.end == "time is up"
