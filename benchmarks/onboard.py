@@ -77,7 +77,7 @@ def measure(seconds: float) -> dict[str, Any]:
         port, camera = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
         world = start(
             place, "simulate", "hover.toml", "--serve", "--flight-files", "files", "--mavlink-port", str(port),
-            "--camera-port", str(camera),
+            "--camera-port", str(camera), said=subprocess.DEVNULL,
         )  # fmt: skip
         until = time.monotonic() + 60.0
         while not (place / "files" / "flight.toml").exists() and time.monotonic() < until:
@@ -96,9 +96,10 @@ def measure(seconds: float) -> dict[str, Any]:
         return read(said, place / "o.mcap")
 
 
-def start(place: Path, *arguments: str) -> subprocess.Popen[str]:
+def start(place: Path, *arguments: str, said: int = subprocess.PIPE) -> subprocess.Popen[str]:
+    """Start a command of deckfix; a pipe that nobody reads would fill and stop it, so that ``said`` may be DEVNULL."""
     command = [sys.executable, "-m", "deckfix.cli", *arguments]
-    return subprocess.Popen(command, cwd=place, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    return subprocess.Popen(command, cwd=place, text=True, stdout=said, stderr=subprocess.STDOUT)
 
 
 def free(kind: socket.SocketKind) -> int:
