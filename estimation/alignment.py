@@ -14,10 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimation.band import BAND_PARAMETERS, BAND_SIZE, band_stationary
 from estimation.config import Config
-from estimation.deck import CHAINS, MOTION_SIZE, places, prior_motion
 from estimation.events import Kind
+from estimation.first_state import FirstAttitude, Start, first_state
 from estimation.frames import (
     Array,
     euler_to_quat,
@@ -31,32 +30,9 @@ from estimation.frames import (
     quat_to_matrix,
     wrap_pi,
 )
-from estimation.models import pressure_altitude
 from estimation.parameters import Site
 from estimation.rows import FilterState, Rows
-from estimation.state import (
-    ACCEL_BIAS,
-    ATTITUDE,
-    BARO_BIAS,
-    BB0,
-    BG0,
-    CAMERA_LATENCY,
-    CAMERA_MOUNT,
-    GPS_BIAS,
-    GYRO_BIAS,
-    P0,
-    PLATFORM_DRIFT,
-    PLATFORM_LEVEL,
-    PLATFORM_OFFSET,
-    POSITION,
-    Q0,
-    RANGE_SCALE,
-    V0,
-    VELOCITY,
-    Layout,
-    nominal_zero,
-)
-from estimation.update import MEMORY_SIZE
+from estimation.state import Layout
 
 REST_GYRO_RADPS = 0.05
 """Largest standard deviation of the angular velocity at rest [rad/s]."""
@@ -70,16 +46,10 @@ HEADING_MEMORY_S = 60.0
 """Memory of the heading from accelerations."""
 DIFFERENCE_NS = 1_000_000_000
 """Spacing of the fixes whose difference stands for a velocity that the receiver does not give."""
-DERIVED_SIGMA_MPS = 1.0
-"""1-sigma of a velocity from the difference of two fixes: half an interval old, under unknown acceleration."""
 PATIENCE_NS = 3_000_000_000
 """How long a start waits for a barometer after the first fix."""
 TRY_NS = 100_000_000
 """Spacing of the attempts to start."""
-UNKNOWN_PLACE_M = 1000.0
-"""1-sigma of the platform's place before it is seen, where no anchor is configured [m]."""
-UNKNOWN_LEVEL_M = 100.0
-"""1-sigma of the platform's height before it is seen [m]."""
 FRESH_NS = 1_200_000_000
 """Oldest GPS, magnetometer or attitude that a start may use."""
 
@@ -90,16 +60,6 @@ class Aligned:
 
     site: Site
     state: FilterState
-    note: str
-
-
-@dataclass(frozen=True, slots=True)
-class FirstAttitude:
-    """Body-to-NED quaternion, 1-sigma of its yaw [rad], whether that came from the magnetometer, and in words."""
-
-    q: Array
-    yaw_sigma: float
-    magnetic: bool
     note: str
 
 
@@ -279,12 +239,11 @@ class Aligner:
             return None
         window = self._window()
         rest = self._still(window)
-        velocity = self._velocities[-1][1]
         site = self.site or self._site()
         attitude = self._first_attitude(t, window, rest, site)
         if attitude is None:
             return None
-        return Aligned(site, self._state(t, attitude, rest, velocity, site), attitude.note)
+        return Aligned(site, self._start(t, attitude, rest, site), attitude.note)
 
     def _site(self) -> Site:
         assert self._fix is not None
@@ -386,104 +345,41 @@ class Aligner:
         a = (v1 - v0) / span
         return self._impulse_between(t0, t1) / span, np.where(np.isfinite(a), a, 0.0)
 
-    def _state(self, t: int, first: FirstAttitude, rest: bool, velocity: Array, site: Site) -> FilterState:
+    def _start(self, t: int, attitude: FirstAttitude, rest: bool, site: Site) -> FilterState:
         assert self._fix is not None
-        c, o = self.config, self.layout.offsets
         window = self._window()
-        q, yaw_sigma = first.q, first.yaw_sigma
-        x = nominal_zero()
-        fix_t, fix, own = self._fix
-        up_to_date = np.where(np.isfinite(velocity), velocity, 0.0)
-        x[P0 : P0 + 3] = geodetic_to_ned(fix[0], fix[1], fix[2], np.array(site.origin)) + up_to_date * (
-            (t - fix_t) * 1e-9
-        )
-        x[V0 : V0 + 3] = 0.0 if rest else up_to_date
-        x[Q0 : Q0 + 4] = q
-        R = quat_to_matrix(q)
-        x[P0 : P0 + 3] -= R @ np.array(c.gps.lever_arm_m)
-        if not rest and not self._velocity_derived:
-            # Carry the velocity on from its fix, where the window reaches back to it.
-            since = max(self._velocities[-1][0], self._imu[0][0])
-            gravity = np.array([0.0, 0.0, normal_gravity(site.origin[0], site.origin[2])])
-            x[V0 : V0 + 3] += R @ self._impulse_between(since, t) + gravity * ((t - since) * 1e-9)
-        bias_known = rest or self.gyro_bias is not None
+        velocity_t, velocity, _ = self._velocities[-1]
+        velocity = np.where(np.isfinite(velocity), velocity, 0.0)
         if rest:
-            x[BG0 : BG0 + 3] = window[:, :3].mean(axis=0)
-        elif self.gyro_bias is not None:
-            x[BG0 : BG0 + 3] = self.gyro_bias
-        P = np.zeros((self.layout.size, self.layout.size))
-
-        def put(block: int, variances: Array) -> None:
-            start = int(o[block])
-            P[start : start + len(variances), start : start + len(variances)] = np.diag(variances)
-
-        stated = np.where(np.isfinite(own[[0, 3, 5]]), own[[0, 3, 5]], 0.0)
-        g = c.gps
-        floor = np.array([g.position_sigma_m, g.position_sigma_m, g.height_sigma_m]) ** 2
-        white = np.maximum(floor, stated * (g.white_fraction**2 if g.bias else 1.0))
-        put(POSITION, white)
-        speed = 4.0 * np.array([g.velocity_sigma_mps, g.velocity_sigma_mps, g.climb_sigma_mps]) ** 2
-        put(VELOCITY, speed + DERIVED_SIGMA_MPS**2 if self._velocity_derived and not rest else speed)
-        tilt = c.initialisation.tilt_sigma_rad if rest else c.initialisation.flight_tilt_sigma_rad
-        a = int(o[ATTITUDE])
-        errors = np.eye(3)
-        if first.magnetic and self._mag is not None:
-            # A tilt error turns the field's steep part into a heading error: that of the yaw hangs on the tilt's.
-            field_n = R @ self._mag[1]
-            dip = field_n[2] / max(math.hypot(field_n[0], field_n[1]), 1e-12)
-            errors[2, :2] = dip * np.array([math.cos(site.declination_rad), math.sin(site.declination_rad)])
-        half = R.T @ errors @ np.diag([tilt, tilt, yaw_sigma])
-        P[a : a + 3, a : a + 3] = half @ half.T
-        averaged_s = (self._imu[-1][0] - self._imu[0][0]) * 1e-9
-        known = max((0.1 * c.imu.gyro_bias_sigma) ** 2, c.imu.gyro_noise**2 / averaged_s)
-        put(GYRO_BIAS, np.full(3, known if bias_known else c.imu.gyro_bias_sigma**2))
-        put(ACCEL_BIAS, np.full(3, c.imu.accel_bias_sigma**2))
-        if o[GPS_BIAS] >= 0:
-            bias = np.array([g.bias_sigma_m, g.bias_sigma_m, g.height_bias_sigma_m]) ** 2
-            put(GPS_BIAS, bias)
-            p, b = int(o[POSITION]), int(o[GPS_BIAS])
-            # position = fix - bias
-            for i in range(3):
-                P[p + i, p + i] += bias[i]
-                P[p + i, b + i] = P[b + i, p + i] = -bias[i]
-        if o[BARO_BIAS] >= 0:
-            k, d = int(o[BARO_BIAS]), int(o[POSITION]) + 2
-            if self._pressure is not None:
-                # offset = pressure altitude - height: known as well as the height is.
-                x[BB0] = pressure_altitude(self._pressure[1]) - site.origin[2] + x[P0 + 2]
-                P[k, :] = P[d, :]
-                P[:, k] = P[:, d]
-                P[k, k] = P[d, d] + c.barometer.sigma_m**2
-            else:
-                P[k, k] = 100.0**2
-        motion = np.zeros(MOTION_SIZE)
-        if o[PLATFORM_OFFSET] >= 0:
-            motion = self._put_platform(P)
-        memory = np.zeros((self.sensors, MEMORY_SIZE))
-        clock = np.array([t, t, t], dtype=np.int64)
-        return FilterState(clock, x, P, self._imu[-1][1].copy(), np.zeros(4), memory, motion, np.zeros(3))
-
-    def _put_platform(self, P: Array) -> Array:
-        """Write what is known of the platform before it is seen into P; return the parameters of its motion."""
-        d, v, o = self.config.platform, self.config.vision, self.layout.offsets
-
-        def put(block: int, covariance: Array) -> None:
-            start = int(o[block])
-            P[start : start + len(covariance), start : start + len(covariance)] = covariance
-
-        radius = UNKNOWN_PLACE_M if d.anchor_radius_m is None else d.anchor_radius_m
-        put(PLATFORM_OFFSET, np.eye(2) * radius**2)
-        put(PLATFORM_DRIFT, np.eye(2) * d.drift_sigma_mps**2)
-        put(PLATFORM_LEVEL, np.eye(1) * UNKNOWN_LEVEL_M**2)
-        motion = prior_motion(d)
-        for chain in CHAINS:
-            _, start = places(chain, o)
-            stationary = band_stationary(motion[chain : chain + BAND_PARAMETERS])
-            P[start : start + BAND_SIZE, start : start + BAND_SIZE] = stationary
-        put(RANGE_SCALE, np.eye(1) * v.scale_sigma**2)
-        put(CAMERA_LATENCY, np.eye(1) * v.latency_sigma_s**2)
-        put(CAMERA_MOUNT, np.eye(3) * v.mount_sigma_rad**2)
-        return motion
+            velocity = np.zeros(3)
+        elif not self._velocity_derived:
+            # Carry the velocity on from its fix, where the window reaches back to it.
+            since = max(velocity_t, self._imu[0][0])
+            gravity = np.array([0.0, 0.0, normal_gravity(site.origin[0], site.origin[2])])
+            impulse = self._impulse_between(since, t)
+            velocity = velocity + quat_to_matrix(attitude.q) @ impulse + gravity * ((t - since) * 1e-9)
+        fix_t, fix, own = self._fix
+        return first_state(
+            Start(
+                t_ns=t,
+                attitude=attitude,
+                rest=rest,
+                velocity=velocity,
+                velocity_derived=self._velocity_derived and not rest,
+                fix=fix,
+                fix_covariance=own,
+                fix_age_s=(t - fix_t) * 1e-9,
+                gyro_bias=window[:, :3].mean(axis=0) if rest else self.gyro_bias,
+                averaged_s=(self._imu[-1][0] - self._imu[0][0]) * 1e-9,
+                imu=self._imu[-1][1].copy(),
+                magnetic_field=self._mag[1] if attitude.magnetic and self._mag is not None else None,
+                pressure_pa=None if self._pressure is None else self._pressure[1],
+            ),
+            site,
+            self.config,
+            self.layout,
+            self.sensors,
+        )
 
 
 def _attitude_from(force: Array, up: Array, yaw: float) -> Array:

@@ -41,8 +41,8 @@ _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 _Share = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 
 CLOCKS = (AUTOPILOT, COMPANION, CAMERA)
-START_S = 1.5
-"""About when an estimator that waits at rest starts [s]."""
+START_S = 1.0
+"""About when the state of an estimator that waits at rest begins [s]."""
 
 
 class Stream(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
