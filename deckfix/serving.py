@@ -150,6 +150,7 @@ class Served:
     def run(self) -> Flown:
         """Fly in real time until the mission ends or ``stop`` is set; raises ``InputError`` where that is too slow."""
         m = self.vehicle.messages
+        self.vehicle.warm_up()
         self._protocol, self._parser = m.MAVLink(None, 1, 1), m.MAVLink(None, 1, 1)
         # OpenCV opens a camera only once it has seen a picture: the view from where the vehicle stands.
         still = self.pictures.render(self.vehicle.still())

@@ -233,6 +233,12 @@ class World:
         self._touch = np.full(4, -1.0)
         self._deck = self._deck_now()
 
+    def warm_up(self) -> None:
+        """Advance copies by a tick, so that nothing is compiled once time runs; the world stays as it is."""
+        moving = [a.copy() for a in (self._x, self._own, self._set)]
+        written = [a.copy() for a in (self._truth, self._trail, self._touch)]
+        self._advance(*moving, np.zeros(3), self._deck, True, self._p, *written)
+
     def tick(self) -> None:
         """Go on by one tick: the vehicle, its sensors, the estimator, the decision."""
         m = self.mission

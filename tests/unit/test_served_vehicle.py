@@ -91,6 +91,22 @@ def names(messages: list[Any]) -> set[str]:
     return {m.get_type() for m in messages}
 
 
+def test_nothing_is_left_to_compile_when_time_begins() -> None:
+    pytest.importorskip("numba")
+    world = Autopilot.of(mission(), 1, Lens(lambda now: None), "compiled")
+    other = Autopilot.of(mission(), 1, Lens(lambda now: None), "compiled")
+    assert not world._advance.signatures
+    world.warm_up()
+    (signature,) = world._advance.signatures
+    for vehicle in (world, other):
+        for number in (105, 24, 30):
+            ask(vehicle, number, 50.0)
+    said = [[str(m) for m in fly(vehicle, 4.0)] for vehicle in (world, other)]
+    assert world._advance.signatures == [signature]
+    assert said[0] == said[1]
+    assert len(said[0]) > 100
+
+
 def test_nothing_is_streamed_until_it_is_asked_for(vehicle: Autopilot) -> None:
     assert fly(vehicle, 0.4) == []
     assert ask(vehicle, 105, 50.0).result == 0
