@@ -16,6 +16,7 @@ from estimation.heave.forecast import Coefficients, Forecast
 from estimation.heave.series import WINDOW_S, Window, cut_window
 from estimation.heave.sinusoids import fit_sinusoids
 from estimation.heave.spectrum import LearnedSpectrum, SpectrumSettings, grid_span, learn
+from estimation.one_thread import one_thread
 
 Array = NDArray[np.float64]
 Method = Literal["bhr", "sinusoids", "mean"]
@@ -271,14 +272,15 @@ def fit(
     window = cut_window(t_s, heave_m, sigma_m, window_s=window_s)
     reason = _too_little(window, settings)
     learned = None
-    if reason or method == "mean":
-        method = "mean"
-        coefficients = _level_only(window, reason, previous)
-    elif method == "sinusoids":
-        coefficients = fit_sinusoids(window, components, settings.lowest_hz, settings.highest_hz)
-    else:
-        learned = learn(window, settings, previous.learned if previous is not None else None)
-        coefficients = _of_spectrum(window, learned, settings)
+    with one_thread():
+        if reason or method == "mean":
+            method = "mean"
+            coefficients = _level_only(window, reason, previous)
+        elif method == "sinusoids":
+            coefficients = fit_sinusoids(window, components, settings.lowest_hz, settings.highest_hz)
+        else:
+            learned = learn(window, settings, previous.learned if previous is not None else None)
+            coefficients = _of_spectrum(window, learned, settings)
     return HeaveModel(
         method,
         reason,

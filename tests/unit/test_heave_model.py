@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from estimation import heave
 from estimation.heave.series import cut_window
@@ -43,6 +44,19 @@ def fit_swell(seed: int = 0, **options: object) -> tuple[heave.HeaveModel, float
     t = times(rng)
     measured = 5.0 + swell(t) + rng.normal(0, 0.03, len(t))
     return heave.fit(t, measured, 0.03, **options), float(t[-1])  # type: ignore[arg-type]
+
+
+def test_a_fit_has_the_same_bytes_on_any_number_of_threads() -> None:
+    """On two threads the likelihood's last bits differ, and the search ends some 1e-5 elsewhere."""
+    rng = np.random.default_rng(3)
+    t = times(rng)
+    seen = irregular(t, 3) + 0.03 * rng.standard_normal(len(t))
+    fitted = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, user_api="blas"):
+            fitted.append(heave.fit(t, seen, 0.03))
+    np.testing.assert_array_equal(fitted[0].power_m2, fitted[1].power_m2)
+    np.testing.assert_array_equal(fitted[0].forecast(AHEAD), fitted[1].forecast(AHEAD))
 
 
 def test_regular_swell_is_described_and_forecast() -> None:
