@@ -59,6 +59,7 @@ from estimation.state import (
     PLATFORM_SWAY,
     PO0,
     SIZES,
+    V0,
     Layout,
     Offsets,
     plus,
@@ -210,7 +211,9 @@ def _fuse(
     if kind == VISION:
         seen_place(r, R, x, p, result[8:14])
         result[15:18] = moved
-    result[20] = math.log(determinant(S, m))
+        for j in range(3):
+            result[20 + j] = P[V0 + j, V0 + j]
+    result[23] = math.log(determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     mark = 0

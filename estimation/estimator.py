@@ -115,7 +115,11 @@ class LandingEstimator:
         self._latency = np.round(latencies_s(c, self.facts) * 1e9)
         if c.platform.use is True and c.platform.learn_s > 0.0:
             self._learner = MotionLearner(
-                c.platform.learn_s, c.platform.learn_window_s, prior_motion(c.platform)
+                c.platform.learn_s,
+                c.platform.learn_window_s,
+                prior_motion(c.platform),
+                c.imu.accel_noise,
+                c.imu.gyro_noise,
             )
         self._new_aligner()
 

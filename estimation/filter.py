@@ -20,7 +20,7 @@ from estimation.frames import Array
 from estimation.outcome import Outcome
 from estimation.relinearise import moved_far, relinearise
 from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
-from estimation.state import ATTITUDE, P0, PL0, PO0, Layout, plus
+from estimation.state import ATTITUDE, P0, PL0, PO0, V0, Layout, plus
 from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.watch import LET_GO, let_go, unexplained
 
@@ -172,6 +172,7 @@ class FilterPyEngine:
         if kind == models.VISION:
             seen_place(r, R, s.x, self.p, rows.seen[i])
             rows.seen[i, 7:10] = s.moved
+            rows.seen[i, 12:15] = np.diag(s.P)[V0 : V0 + 3]
         w = update.weight(nis, m, self.p)
         if kind == models.VISION and unexplained(memory, t_s, r, S, w, s.x, self.p, s.motion):
             rows.reset[i] = LET_GO

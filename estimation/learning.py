@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -58,12 +59,14 @@ class MotionLearner:
 
     The times of the fits are whole multiples of ``every_s`` of the inertial clock. ``parameters`` (22,) are the prior's
     at first, and then what was learned (``estimation.deck``); ``blocks`` are the chains whose form was, by their first
-    place in them.
+    place in them. ``accel_noise`` [m/s^2/rtHz] and ``gyro_noise`` [rad/s/rtHz] are the inertial unit's.
     """
 
     every_s: float
     window_s: float
     parameters: Array
+    accel_noise: float
+    gyro_noise: float
     model: HeaveModel | None = None
     blocks: dict[int, BandPass] = field(default_factory=dict)
     sway: list[HeaveModel | None] = field(default_factory=lambda: [None, None])
@@ -127,7 +130,7 @@ class MotionLearner:
             if not self._t_ns or t_ns - self._t_ns[-1] > GAP_S * 1e9:
                 self._settled_ns = t_ns + int(SETTLING_S * 1e9)
             self._t_ns.append(t_ns)
-            unsettled = [*seen[:6], math.nan, *seen[7:10], math.nan, math.nan]
+            unsettled = [*seen[:6], math.nan, *seen[7:10], math.nan, math.nan, *seen[12:]]
             self._seen.append(seen if t_ns >= self._settled_ns else unsettled)
 
     def _drift(self, mean: Array) -> Array:
@@ -158,7 +161,8 @@ class MotionLearner:
         level = self._drift(seen[now, 6])
         height = seen[now, 0] - level + fast_part(t[now], level + seen[now, 9])
         sigma = np.sqrt(seen[now, 1])
-        self.model = fit(t[now], height, sigma, window_s=self.window_s, previous=self.model)
+        wander = partial(inertial_wander, float(seen[now, 14].mean()), self.accel_noise, 0.0)
+        self.model = fit(t[now], height, sigma, window_s=self.window_s, previous=self.model, wander=wander)
         if self.model.method == "bhr":
             self._take(HEAVE, self.model)
         axis = self._count % SWAY_EVERY
@@ -167,7 +171,9 @@ class MotionLearner:
             place, sigma = seen[:, 2 + 2 * axis], np.sqrt(seen[:, 3 + 2 * axis])
             mean, moved = self._drift(seen[:, 10 + axis]), seen[:, 7 + axis]
             swing = place - mean + fast_part(t, mean - moved)
-            model = fit(t, swing, sigma, window_s=self.window_s, previous=self.sway[axis])
+            speed = float(seen[:, 12 + axis].mean())
+            wander = partial(inertial_wander, speed, self.accel_noise, self.gyro_noise)
+            model = fit(t, swing, sigma, window_s=self.window_s, previous=self.sway[axis], wander=wander)
             self.sway[axis] = model
             if model.learned is not None:
                 self._take(CHAINS[1 + axis], model)
@@ -223,6 +229,23 @@ def fast_part(t_s: Array, y: Array) -> Array:
     w0, w1, w2 = w.sum(axis=1), (w * away).sum(axis=1), (w * away**2).sum(axis=1)
     y0, y1 = w @ y, (w * away) @ y
     return np.asarray(y - np.interp(t_s, grid, (w2 * y0 - w1 * y1) / (w0 * w2 - w1**2)))
+
+
+def inertial_wander(
+    velocity_variance: float, accel_noise: float, gyro_noise: float, frequency_hz: Array
+) -> Array:
+    """Return the one-sided density (m,) [m^2/Hz] of the wander of a series that ``fast_part`` has completed.
+
+    The series' zero moves with the error of the vehicle's velocity [m^2/s^2]. In a steady filter of place and velocity
+    of bandwidth w_b that error has the density 4 a^2 (w^2 + w_b^2) / (w^4 + w_b^4): half of it is the noise of the
+    specific force, half what measurements correct. w_b follows from its variance, sqrt(2) a^2 / w_b. Horizontally
+    the noise of the angular velocity, which tilts gravity, adds to a^2 (derived in docs/concepts.md).
+    """
+    omega = 2.0 * math.pi * frequency_hz
+    noise = accel_noise**2 + (9.81 * gyro_noise / omega) ** 2
+    band = math.sqrt(2.0) * noise / velocity_variance
+    density = 4.0 * noise * (omega**2 + band**2) / (omega**2 * (omega**4 + band**4))
+    return np.asarray(density * (1.0 - np.exp(-0.5 * (omega * SLOW_SIGMA_S) ** 2)) ** 2)
 
 
 def broad_motion(sigma_m: float, rate_mps: float, damping: float) -> Array:

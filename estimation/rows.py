@@ -22,7 +22,7 @@ PENDING = -1
 
 T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = range(10)
 """Columns of ``Rows.ints``."""
-VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 32, 33
+VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 35, 36
 """First columns in ``Rows.floats``, and their number."""
 HEAVE_MODEL = 10
 """Kind of a row that is no measurement: from here on a chain of the platform's motion has the parameters in ``value``
@@ -31,17 +31,17 @@ and ``own`` (``estimation.deck.take_up``)."""
 
 @dataclass(slots=True)
 class Rows:
-    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 33), with a view for each column.
+    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 36), with a view for each column.
 
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
     the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
     the inertial clock was past the content when it arrived. ``value`` and ``own`` (n, 6) are the event's value and
     covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved, 2 where the learned
     heave was let go) and ``result`` (n, 8):
-    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 12): where a fix shows the deck
+    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 15): where a fix shows the deck
     (``estimation.deck.seen_place``), the level after it was fused, how far measurements had moved the vehicle north,
-    east and down, and the mean place after it [m], and ``log_det``: logarithm of the determinant of the innovation's
-    covariance.
+    east and down, the mean place after it [m] and the variances of the vehicle's velocity before it [m^2/s^2], and
+    ``log_det``: logarithm of the determinant of the innovation's covariance.
     """
 
     ints: Int

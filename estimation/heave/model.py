@@ -15,7 +15,7 @@ from estimation.heave.basis import Basis
 from estimation.heave.forecast import Coefficients, Forecast
 from estimation.heave.series import WINDOW_S, Window, cut_window
 from estimation.heave.sinusoids import fit_sinusoids
-from estimation.heave.spectrum import LearnedSpectrum, SpectrumSettings, grid_span, learn
+from estimation.heave.spectrum import Density, LearnedSpectrum, SpectrumSettings, grid_span, learn
 from estimation.one_thread import one_thread
 
 Array = NDArray[np.float64]
@@ -251,6 +251,7 @@ def fit(
     window_s: float = WINDOW_S,
     settings: SpectrumSettings | None = None,
     previous: HeaveModel | None = None,
+    wander: Density | None = None,
 ) -> HeaveModel:
     """Fit a heave model to a series.
 
@@ -258,7 +259,8 @@ def fit(
     scalar or (n,). Methods: ``bhr`` learns a smooth spectrum (``estimation.heave.spectrum``); ``sinusoids``
     is the plain sum of ``components`` sinusoids by least squares; ``mean`` only the level. Samples older than
     ``window_s`` before the last are not used. ``previous`` lets ``bhr`` start its search from an earlier
-    model.
+    model. ``wander`` tells ``bhr`` of noise that is not white, such as the wander of a vehicle that the heave is
+    seen from: its one-sided density [m^2/Hz], a function of frequencies (m,) [Hz].
 
     A series too short for a model (one sample, less than 5 s, fewer than 16 bins) gives ``method="mean"``
     with the reason; nothing is known about a motion never seen, so its variance is then infinite unless
@@ -279,7 +281,7 @@ def fit(
         elif method == "sinusoids":
             coefficients = fit_sinusoids(window, components, settings.lowest_hz, settings.highest_hz)
         else:
-            learned = learn(window, settings, previous.learned if previous is not None else None)
+            learned = learn(window, settings, previous.learned if previous is not None else None, wander)
             coefficients = _of_spectrum(window, learned, settings)
     return HeaveModel(
         method,

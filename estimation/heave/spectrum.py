@@ -12,6 +12,10 @@ of a wind sea on a small raft: the fewer the data, the closer the result stays t
 is left uncertain of the spectrum enters twice: its mean, not its mode, is taken, and the coefficients'
 covariance is widened by the delta method.
 
+A series may hang on something that wanders itself, as a deck's height does that is seen from a vehicle. The
+density of that wander, where it is told, is noise of the same harmonics: K holds it, what is learned is the spectrum
+beside it, and the coefficients are those of the motion alone.
+
 The likelihood is evaluated in a compressed space: the samples are projected on the few hundred directions
 that the band can excite within the window.
 """
@@ -19,6 +23,7 @@ that the band can excite within the window.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +33,8 @@ from estimation.heave.basis import Basis, dense_basis
 from estimation.heave.series import Window
 
 Array = NDArray[np.float64]
+Density = Callable[[Array], Array]
+"""One-sided density [m^2/Hz] of a noise that is not white, at frequencies (m,) [Hz]."""
 
 PEAK_MEAN = np.array([0.0, 0.0, 0.8, 6.0])
 PEAK_SIGMA = np.array([1e3, 1e3, 0.7, 2.0])
@@ -91,7 +98,7 @@ class _Problem:
     """The compressed regression: columns U (r, k), data y (r,), noise of one common variance.
 
     ``outside`` directions of the data that no column reaches hold noise alone, ``outside_square`` their sum of
-    squares: they tell how large the noise really is.
+    squares: they tell how large the noise really is. ``wander`` (m,) variances of the noise's own harmonics.
     """
 
     columns: Array
@@ -100,21 +107,23 @@ class _Problem:
     level_variance: float
     outside: int
     outside_square: float
+    wander: Array
 
     def prior(self, power: Array, drift_variance: float) -> Array:
         drift = np.full(self.columns.shape[1] - 2 * self.harmonics - 1, drift_variance)
         return np.concatenate([power, power, [self.level_variance], drift])
 
     def evidence(self, prior: Array, noise: float) -> tuple[float, Array, float, Array, Array]:
-        """Likelihood of the prior variances (k,) and of the noise's variance, K = U S U' + noise I.
+        """Likelihood of the prior variances (k,) and of the noise's variance, K = U (S + wander) U' + noise I.
 
         Returns the negative log likelihood, its gradient per prior variance (k,) and by the log of the noise's
         variance, the whitened columns L^-1 U (r, k), and U' K^-1 y (k,).
         """
         from scipy.linalg import blas, lapack
 
-        u = self.columns
-        k = blas.dsyrk(1.0, u * np.sqrt(prior), lower=1)
+        u, total = self.columns, prior.copy()
+        total[: 2 * self.harmonics] += np.tile(self.wander, 2)
+        k = blas.dsyrk(1.0, u * np.sqrt(total), lower=1)
         k[np.diag_indices_from(k)] += noise
         lower, info = lapack.dpotrf(k, lower=1, overwrite_a=1)
         if info:
@@ -125,7 +134,7 @@ class _Problem:
         score = u.T @ solved
         power = np.einsum("ij,ij->j", whitened, whitened)
         value += 0.5 * (self.outside * math.log(noise) + self.outside_square / noise)
-        explained = len(solved) - float(prior @ power) - noise * float(solved @ solved)
+        explained = len(solved) - float(total @ power) - noise * float(solved @ solved)
         by_noise = 0.5 * (explained + self.outside - self.outside_square / noise)
         return value, 0.5 * (power - score**2), by_noise, whitened, score
 
@@ -168,12 +177,16 @@ def grid_span(window: Window) -> float:
 
 
 def learn(
-    window: Window, settings: SpectrumSettings | None = None, previous: LearnedSpectrum | None = None
+    window: Window,
+    settings: SpectrumSettings | None = None,
+    previous: LearnedSpectrum | None = None,
+    wander: Density | None = None,
 ) -> LearnedSpectrum:
     """Learn the spectrum of one window and the coefficients in it.
 
     ``previous`` is an earlier result to start the search from; the result is the same up to the search's
-    tolerance. Cost: about 2 ms an iteration at 60 s.
+    tolerance. ``wander`` is the density of the wander of the series' own zero, None for none. Cost: about 2 ms an
+    iteration at 60 s.
     """
     from scipy.optimize import OptimizeResult, minimize
 
@@ -181,9 +194,9 @@ def learn(
     span = grid_span(window)
     lowest = max(settings.lowest_hz, settings.lowest_cycles / span)
     basis = dense_basis(span, window.interval_s, lowest, settings.highest_hz, settings.horizon_s)
-    problem = _compress(window, basis, settings)
+    problem = _compress(window, basis, settings, _wander_power(basis, wander))
     bumps = _bumps(basis.frequency_hz, span, settings)
-    first, top = _first_guess(window, basis, settings)
+    first, top = _first_guess(window, basis, settings, wander)
     shape = _Shape(basis.frequency_hz, bumps, settings.floor * math.exp(top))
     log_drift = 2.0 * math.log(settings.drift_mps)
     centre = np.concatenate([np.tile(PEAK_MEAN, PEAKS), [log_drift, 0.0], np.zeros(bumps.shape[1])])
@@ -238,7 +251,14 @@ def learn(
     return LearnedSpectrum(basis, power, mean, covariance, x, drift, scale, evaluations, age)
 
 
-def _compress(window: Window, basis: Basis, settings: SpectrumSettings) -> _Problem:
+def _wander_power(basis: Basis, wander: Density | None) -> Array:
+    """Return the variance of each harmonic's coefficients (m,) [m^2] of a noise of this density."""
+    if wander is None:
+        return np.zeros(len(basis.frequency_hz))
+    return wander(basis.frequency_hz) * float(basis.frequency_hz[1] - basis.frequency_hz[0])
+
+
+def _compress(window: Window, basis: Basis, settings: SpectrumSettings, wander: Array) -> _Problem:
     """Whiten, and project on harmonics spaced as for a slightly longer window: the whole band is kept."""
     weight = 1.0 / np.sqrt(window.variance_m2)[:, None]
     extended = 1.15 * grid_span(window) + 2.0
@@ -256,7 +276,7 @@ def _compress(window: Window, basis: Basis, settings: SpectrumSettings) -> _Prob
     # The mean is taken off already: a level much wider than what is left only costs the arithmetic its digits.
     left = 10.0 * float(np.ptp(window.value_m)) + 1e3 * math.sqrt(float(window.variance_m2.max()))
     level_variance = min(settings.level_sigma_m, left) ** 2
-    return _Problem(columns, data, len(basis.frequency_hz), level_variance, outside, max(0.0, square))
+    return _Problem(columns, data, len(basis.frequency_hz), level_variance, outside, max(0.0, square), wander)
 
 
 def _bumps(frequency: Array, span_s: float, settings: SpectrumSettings) -> Array:
@@ -272,7 +292,9 @@ def _bumps(frequency: Array, span_s: float, settings: SpectrumSettings) -> Array
     return bumps
 
 
-def _first_guess(window: Window, basis: Basis, settings: SpectrumSettings) -> tuple[Array, float]:
+def _first_guess(
+    window: Window, basis: Basis, settings: SpectrumSettings, wander: Density | None
+) -> tuple[Array, float]:
     """Two peaks from a Hann-tapered periodogram, and the log of the largest power on the grid."""
     t, span = window.time_s, max(window.span_s, 5.0)
     taper = 0.5 - 0.5 * np.cos(
@@ -282,7 +304,9 @@ def _first_guess(window: Window, basis: Basis, settings: SpectrumSettings) -> tu
     frequency = frequency[(frequency >= basis.frequency_hz[0]) & (frequency <= basis.frequency_hz[-1])]
     level = float(taper @ window.value_m / taper.sum())
     line = np.exp(-2j * np.pi * np.outer(frequency, t)) @ (taper * (window.value_m - level))
-    noise = window.noise_density_m2ps
+    noise = np.full(len(frequency), window.noise_density_m2ps)
+    if wander is not None:
+        noise += wander(frequency)
     density = np.maximum(2.0 * np.abs(line) ** 2 * span / (len(t) * (taper @ taper)) - noise, 0.02 * noise)
     smooth = np.convolve(np.pad(density, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
     spacing = float(basis.frequency_hz[1] - basis.frequency_hz[0])
@@ -303,7 +327,7 @@ def _log_covariance(
 ) -> Array:
     """Covariance of the parameters (p, p): the inverse of Fisher's information plus the prior's.
 
-    The information on the variances of the coefficients is 1/2 W o W with W = U' K^-1 U.
+    The information on the variances of the coefficients is 1/2 W o W with W = U' K^-1 U; the wander's are known.
     """
     prior = problem.prior(power, math.exp(x[where]))
     _, _, _, whitened, _ = problem.evidence(prior, math.exp(x[where + 1]))

@@ -46,6 +46,27 @@ def fit_swell(seed: int = 0, **options: object) -> tuple[heave.HeaveModel, float
     return heave.fit(t, measured, 0.03, **options), float(t[-1])  # type: ignore[arg-type]
 
 
+def test_a_wander_that_is_told_is_none_of_the_motion() -> None:
+    """The series hangs on a vehicle that wanders as f^-4; the motion is judged, not the series."""
+
+    def wander(f: Array) -> Array:
+        return np.asarray(np.where(f < 0.055, 0.0, 5e-7 / f**4), np.float64)
+
+    squares: dict[bool, list[float]] = {True: [], False: []}
+    f = np.arange(0.06, 1.0, 0.01)
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        t = times(rng)
+        phase = 2 * np.pi * np.outer(t, f)
+        a, b = np.sqrt(wander(f) * 0.01) * rng.standard_normal((2, len(f)))
+        seen = irregular(t, seed) + np.cos(phase) @ a + np.sin(phase) @ b + 0.03 * rng.standard_normal(len(t))
+        for told in (True, False):
+            mean, variance = heave.fit(t, seen, 0.03, wander=wander if told else None).forecast(np.zeros(1))
+            squares[told].append(float((mean - irregular(t[-1:], seed))[0] ** 2 / variance[0]))
+    assert 0.3 < np.mean(squares[True]) < 1.6
+    assert np.mean(squares[False]) > 3.0
+
+
 def test_a_fit_has_the_same_bytes_on_any_number_of_threads() -> None:
     """On two threads the likelihood's last bits differ, and the search ends some 1e-5 elsewhere."""
     rng = np.random.default_rng(3)

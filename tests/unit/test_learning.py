@@ -12,7 +12,14 @@ from estimation.band import band_moments
 from estimation.config import PlatformConfig
 from estimation.deck import DRIFT_SPEED, DRIFT_TIME_S, HEAVE, SWAY_EAST, SWAY_NORTH, prior_motion
 from estimation.events import Kind
-from estimation.learning import DRIFT_PRIOR, DRIFT_SEEN, MotionLearner, drift_velocity
+from estimation.learning import (
+    DRIFT_PRIOR,
+    DRIFT_SEEN,
+    MotionLearner,
+    drift_velocity,
+    fast_part,
+    inertial_wander,
+)
 from estimation.outcome import Outcome
 from estimation.rows import Rows
 from estimation.watch import LET_GO
@@ -29,11 +36,12 @@ def seen(height: Array, north: Array, east: Array, rng: np.random.Generator) -> 
     for column, values in ((0, height), (2, north), (4, east)):
         rows.seen[:, column] = values + NOISE_M * rng.standard_normal(n)
         rows.seen[:, column + 1] = NOISE_M**2
+    rows.seen[:, 12:15] = 0.01**2
     return rows
 
 
 def learner() -> MotionLearner:
-    return MotionLearner(2.0, 60.0, prior_motion(PlatformConfig()))
+    return MotionLearner(2.0, 60.0, prior_motion(PlatformConfig()), 0.01, 5e-4)
 
 
 def told(parameters: Array, chain: int = HEAVE) -> tuple[float, float]:
@@ -82,6 +90,51 @@ def test_steps_of_the_vehicles_own_place_are_no_sea_and_its_drift_is_none_of_the
     assert told(one.parameters, SWAY_EAST)[0] < 0.02 and told(one.parameters, SWAY_EAST)[1] < 0.06
     assert told(one.parameters, HEAVE)[0] < 0.04
     assert one.parameters[DRIFT_SPEED] < 0.75 * PlatformConfig().drift_sigma_mps
+
+
+def wandering(
+    accel_noise: float, readings: list[tuple[Array, float]], rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Return what inertia alone makes, in 80 s at 20 Hz, of a place that a filter of place and velocity holds with
+    readings at 5 Hz, and the variance of its velocity at the end."""
+    dt = 0.05
+    F = np.array([[1.0, dt], [0.0, 1.0]])
+    Q = accel_noise**2 * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+    root, P, error = np.linalg.cholesky(Q), 0.01 * np.eye(2), np.zeros(2)
+    moved, out = 0.0, np.empty(2000)
+    for k in range(2000):
+        error, P = F @ error + root @ rng.standard_normal(2), F @ P @ F.T + Q
+        for h, sigma in readings if k % 4 == 0 else []:
+            gain = P @ h / (h @ P @ h + sigma**2)
+            correction = gain * (sigma * rng.standard_normal() - h @ error)
+            error, moved = error + correction, moved + correction[0]
+            P = P - np.outer(gain, h @ P)
+        out[k] = error[0] - moved
+    return out[400:], float(P[1, 1])
+
+
+@pytest.mark.parametrize(
+    ("accel_noise", "position_m", "velocity_mps"),
+    [(0.01, 0.02, 1.0), (0.01, 1.0, 0.1), (0.03, 0.02, 0.05), (0.1, 0.02, 0.05)],
+)
+def test_the_wander_of_a_series_has_the_density_that_its_velocitys_variance_tells(
+    accel_noise: float, position_m: float, velocity_mps: float
+) -> None:
+    """From a filter that follows inertia for half a minute to one that follows its readings at once; from the slowest
+    sea to the fastest the density falls by five orders."""
+    rng = np.random.default_rng(6)
+    readings = [(np.array([1.0, 0.0]), position_m), (np.array([0.0, 1.0]), velocity_mps)]
+    taper = np.hanning(1600)
+    f = np.fft.rfftfreq(1600, 0.05)[1:]
+    density = np.zeros(len(f))
+    for _ in range(30):
+        series, variance = wandering(accel_noise, readings, rng)
+        y = fast_part(0.05 * np.arange(1600), series)
+        line = np.fft.rfft(taper * (y - y.mean()))[1:]
+        density += 2.0 * np.abs(line) ** 2 * 0.05 / (taper @ taper) / 30
+    share = density / inertial_wander(variance, accel_noise, 0.0, f)
+    for low, high in ((0.07, 0.1), (0.1, 0.2), (0.2, 0.4), (0.4, 0.8)):
+        assert 0.5 < share[(f >= low) & (f < high)].mean() < 2.0
 
 
 def drifting(n: int, sigma_mps: float, rng: np.random.Generator) -> Array:
