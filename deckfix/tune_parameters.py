@@ -43,7 +43,7 @@ DEFAULTS: dict[str, Kind | None] = {
     "vision.angle_sigma_rad": Kind.VISION,
     "vision.range_sigma": Kind.VISION,
     "vision.floor_m": Kind.VISION,
-    "platform.offset_walk": Kind.VISION,
+    "platform.drift_sigma_mps": Kind.VISION,
     "platform.level_walk": Kind.VISION,
     "platform.sway_sigma_m": Kind.VISION,
     "platform.heave_sigma_m": Kind.VISION,

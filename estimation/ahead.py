@@ -25,7 +25,7 @@ class DeckForecast:
     ``height_m``, ``height_sigma_m``, ``rate_mps``, ``rate_sigma_mps`` (m,); ``skill`` (m,) is 1 - variance of the
     rate over that of the sea: 1 is certain, 0 knows nothing but the sea. ``sea_rate_sigma_mps`` is the rate's 1-sigma
     in that sea, ``learned`` tells whether the sea was learned in flight (else it is the configuration's prior).
-    ``sway_mps`` (m, 2) is the deck's horizontal velocity, north and east, of the place's drift and of the sway.
+    ``velocity_mps`` (m, 2) is the deck's horizontal velocity, north and east, of the place's drift and of the sway.
     """
 
     t_ns: int
@@ -37,16 +37,16 @@ class DeckForecast:
     skill: Array
     sea_rate_sigma_mps: float
     learned: bool
-    sway_mps: Array
+    velocity_mps: Array
 
     def rate_at(self, horizon_s: float) -> tuple[float, float]:
         """Return the rate and its 1-sigma [m/s] at a horizon, interpolated, and held beyond the ends."""
         rate = float(np.interp(horizon_s, self.horizon_s, self.rate_mps))
         return rate, float(np.interp(horizon_s, self.horizon_s, self.rate_sigma_mps))
 
-    def sway_at(self, horizon_s: float) -> Array:
+    def velocity_at(self, horizon_s: float) -> Array:
         """Return the deck's horizontal velocity (2,) [m/s] at a horizon, interpolated, and held beyond the ends."""
-        return np.array([np.interp(horizon_s, self.horizon_s, axis) for axis in self.sway_mps.T])
+        return np.array([np.interp(horizon_s, self.horizon_s, axis) for axis in self.velocity_mps.T])
 
     def quiet_probability(self, begin_s: float, end_s: float, rate_limit_mps: float) -> float:
         """Return the smallest probability, over the horizons from begin to end, that |rate| is below the limit.

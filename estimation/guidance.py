@@ -197,7 +197,7 @@ def deck_rate_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) 
 def sway_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) -> Array:
     """Return the deck's horizontal velocity (2,) [m/s] as it will be when the vehicle has followed the set-point."""
     now: Array = e.velocity_mps[:2] - e.deck[3:5]
-    return now.copy() if forecast is None else forecast.sway_at(ahead_s)
+    return now.copy() if forecast is None else forecast.velocity_at(ahead_s)
 
 
 def _towards(offset: Array, limit: float, gain: float, slowing_mps2: float = math.inf) -> Array:

@@ -55,7 +55,7 @@ def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
     assert forecast.rate_sigma_mps[1] == pytest.approx(math.sqrt(rate @ covariance @ rate), rel=1e-3)
     for axis, band in enumerate((NORTH, EAST)):
         swing, at = band_matrix(band)[5], PS0 + 6 * axis
-        assert forecast.sway_mps[:, axis] == pytest.approx(
+        assert forecast.velocity_mps[:, axis] == pytest.approx(
             [swing @ SWAY[6 * axis : 6 * axis + 6] + DRIFT[axis], swing @ x[at : at + 6] + x[PD0 + axis]],
             abs=1e-6,
         )
