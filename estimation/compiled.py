@@ -210,10 +210,11 @@ def _fuse(
     result[1] = m
     if kind == VISION:
         seen_place(r, R, x, p, result[8:14])
-        result[15:18] = moved
+        result[15:18] = moved[:3]
         for j in range(3):
             result[20 + j] = P[V0 + j, V0 + j]
-    result[23] = math.log(determinant(S, m))
+        result[23:26] = moved[3:]
+    result[26] = math.log(determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     mark = 0
@@ -317,12 +318,13 @@ def _advance(
             t_s = (t - clock[2]) * 1e-9
             if recording:
                 x_before, P_before = state, P.copy()
-            place = state[P0 : P0 + 3].copy()
+            held = state[P0 : V0 + 3].copy()
             ints[i, OUTCOME], ints[i, RESET], state = _fuse(
                 state, P, memory[ints[i, SENSOR]], scatter, ints[i, KIND], floats[i, VALUE:OWN],
                 floats[i, OWN:RESULT], gyro, t_s, ints[i, LATE], p, offsets, motion, moved, H, floats[i, RESULT:],
             )  # fmt: skip
-            moved += state[P0 : P0 + 3] - place
+            moved[:3] += state[P0 : P0 + 3] - held[:3]
+            moved[3:] += (state[V0 : V0 + 3] - held[3:]) ** 2
             if recording and ints[i, OUTCOME] <= _DOWNWEIGHTED:
                 if ints[i, RESET] == 1:
                     _open(t, state, P, motion, trail_count, trail_t, trail_marks, trail_x, trail_P, trail_chain,

@@ -92,9 +92,10 @@ class FilterPyEngine:
                 continue
             if i < following:
                 gyro = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, t)[:3]
-                x, P, place = s.x, s.P, s.x[P0 : P0 + 3].copy()
+                x, P, held = s.x, s.P, s.x[P0 : V0 + 3].copy()
                 self._fuse(rows, i, gyro)
-                s.moved += s.x[P0 : P0 + 3] - place
+                s.moved[:3] += s.x[P0 : P0 + 3] - held[:3]
+                s.moved[3:] += (s.x[V0 : V0 + 3] - held[3:]) ** 2
                 if self.trail.on:
                     self._record(rows, i, x, P)
                 if rows.reset[i] == LET_GO:
@@ -171,8 +172,9 @@ class FilterPyEngine:
         rows.log_det[i] = np.linalg.slogdet(S)[1]
         if kind == models.VISION:
             seen_place(r, R, s.x, self.p, rows.seen[i])
-            rows.seen[i, 7:10] = s.moved
+            rows.seen[i, 7:10] = s.moved[:3]
             rows.seen[i, 12:15] = np.diag(s.P)[V0 : V0 + 3]
+            rows.seen[i, 15:18] = s.moved[3:]
         w = update.weight(nis, m, self.p)
         if kind == models.VISION and unexplained(memory, t_s, r, S, w, s.x, self.p, s.motion):
             rows.reset[i] = LET_GO

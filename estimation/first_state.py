@@ -151,7 +151,7 @@ def first_state(start: Start, site: Site, config: Config, layout: Layout, sensor
     motion = _put_platform(P, c, layout) if o[PLATFORM_OFFSET] >= 0 else np.zeros(MOTION_SIZE)
     memory = np.zeros((sensors, MEMORY_SIZE))
     clock = np.array([start.t_ns] * 3, dtype=np.int64)
-    return FilterState(clock, x, P, start.imu, np.zeros(4), memory, motion, np.zeros(3))
+    return FilterState(clock, x, P, start.imu, np.zeros(4), memory, motion, np.zeros(6))
 
 
 def _put(P: Array, start: int, covariance: Array) -> None:

@@ -20,6 +20,7 @@ from estimation.events import Kind
 from estimation.frames import Array
 from estimation.heave.bandpass import BandPass
 from estimation.heave.model import HeaveModel, fit
+from estimation.heave.spectrum import Density
 from estimation.outcome import Outcome
 from estimation.rows import Rows
 from estimation.watch import LET_GO
@@ -47,6 +48,8 @@ DRIFT_SEEN = 0.57
 """Share of the variance of the drift's velocity that is left in how far such means move in a second."""
 DRIFT_PRIOR = 4.0
 """Weight of the speed that is expected of the drift, in velocities seen: half a minute shows two, on both axes."""
+DOWN = 2
+"""Of north, east and down the axis that no tilt brings gravity into."""
 STILL_M = 0.01
 """Smallest 1-sigma that a platform is believed to move with [m]."""
 SEA_RADPS = (0.44, 5.0)
@@ -161,7 +164,7 @@ class MotionLearner:
         level = self._drift(seen[now, 6])
         height = seen[now, 0] - level + fast_part(t[now], level + seen[now, 9])
         sigma = np.sqrt(seen[now, 1])
-        wander = partial(inertial_wander, float(seen[now, 14].mean()), self.accel_noise, 0.0)
+        wander = self._wander(t[now], seen[now], 2)
         self.model = fit(t[now], height, sigma, window_s=self.window_s, previous=self.model, wander=wander)
         if self.model.method == "bhr":
             self._take(HEAVE, self.model)
@@ -171,8 +174,7 @@ class MotionLearner:
             place, sigma = seen[:, 2 + 2 * axis], np.sqrt(seen[:, 3 + 2 * axis])
             mean, moved = self._drift(seen[:, 10 + axis]), seen[:, 7 + axis]
             swing = place - mean + fast_part(t, mean - moved)
-            speed = float(seen[:, 12 + axis].mean())
-            wander = partial(inertial_wander, speed, self.accel_noise, self.gyro_noise)
+            wander = self._wander(t, seen, axis)
             model = fit(t, swing, sigma, window_s=self.window_s, previous=self.sway[axis], wander=wander)
             self.sway[axis] = model
             if model.learned is not None:
@@ -180,6 +182,13 @@ class MotionLearner:
             self._drifts[axis] = drift_velocity(t, place)
             self.parameters[DRIFT_SPEED] = self._drift_speed()
         return self.model
+
+    def _wander(self, t_s: Array, seen: Array, axis: int) -> Density:
+        """Return the density of the wander of what was seen (n, 18): north, east or down (``inertial_wander``)."""
+        corrected = np.maximum(np.diff(seen[:, 15 + axis]), 0.0).sum() / (t_s[-1] - t_s[0])
+        tilt_noise = 0.0 if axis == DOWN else self.gyro_noise
+        variance = float(seen[:, 12 + axis].mean())
+        return partial(inertial_wander, variance, float(corrected), self.accel_noise, tilt_noise)
 
     def _drift_speed(self) -> float:
         """Return the 1-sigma [m/s] of the drift's velocity: what was seen of it, and the prior in its weight."""
@@ -232,17 +241,19 @@ def fast_part(t_s: Array, y: Array) -> Array:
 
 
 def inertial_wander(
-    velocity_variance: float, accel_noise: float, gyro_noise: float, frequency_hz: Array
+    velocity_variance: float, corrected: float, accel_noise: float, gyro_noise: float, frequency_hz: Array
 ) -> Array:
     """Return the one-sided density (m,) [m^2/Hz] of the wander of a series that ``fast_part`` has completed.
 
-    The series' zero moves with the error of the vehicle's velocity [m^2/s^2]. In a steady filter of place and velocity
-    of bandwidth w_b that error has the density 4 a^2 (w^2 + w_b^2) / (w^4 + w_b^4): half of it is the noise of the
-    specific force, half what measurements correct. w_b follows from its variance, sqrt(2) a^2 / w_b. Horizontally
-    the noise of the angular velocity, which tilts gravity, adds to a^2 (derived in docs/concepts.md).
+    The series' zero moves with the error of the vehicle's velocity. What drives that error is the noise of the
+    specific force, a^2, and what measurements correct, c^2 [m^2/s^3]: the squares of their corrections in a second.
+    In a steady filter of place and velocity both are alike, and with a^2 + c^2 = 2 n^2 it has the density
+    4 n^2 (w^2 + w_b^2) / (w^4 + w_b^4) and the variance sqrt(2) n^2 / w_b, which tells the bandwidth w_b. Where the
+    filter does not yet know its biases it corrects more. Horizontally the noise of the angular velocity, which tilts
+    gravity, adds to n^2 (derived in docs/concepts.md).
     """
     omega = 2.0 * math.pi * frequency_hz
-    noise = accel_noise**2 + (9.81 * gyro_noise / omega) ** 2
+    noise = 0.5 * (accel_noise**2 + corrected) + (9.81 * gyro_noise / omega) ** 2
     band = math.sqrt(2.0) * noise / velocity_variance
     density = 4.0 * noise * (omega**2 + band**2) / (omega**2 * (omega**4 + band**4))
     return np.asarray(density * (1.0 - np.exp(-0.5 * (omega * SLOW_SIGMA_S) ** 2)) ** 2)

@@ -22,7 +22,7 @@ PENDING = -1
 
 T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = range(10)
 """Columns of ``Rows.ints``."""
-VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 35, 36
+VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 38, 39
 """First columns in ``Rows.floats``, and their number."""
 HEAVE_MODEL = 10
 """Kind of a row that is no measurement: from here on a chain of the platform's motion has the parameters in ``value``
@@ -31,17 +31,18 @@ and ``own`` (``estimation.deck.take_up``)."""
 
 @dataclass(slots=True)
 class Rows:
-    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 36), with a view for each column.
+    """Events as rows of two matrices, ``ints`` (n, 10) and ``floats`` (n, 39), with a view for each column.
 
     ``t_ns`` is the time of the content on the estimator's clock; ``id`` the order of arrival; ``late`` is 1 where
     the filter had already passed that time; ``stamp_ns`` and ``arrival_ns`` are the event's own, ``age_ns`` how far
     the inertial clock was past the content when it arrived. ``value`` and ``own`` (n, 6) are the event's value and
     covariance. The engines write ``outcome``, ``reset`` (1 where a lock-out was resolved, 2 where the learned
     heave was let go) and ``result`` (n, 8):
-    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 15): where a fix shows the deck
+    NIS, dimension, innovation (3), its predicted sigma (3), ``seen`` (n, 18): where a fix shows the deck
     (``estimation.deck.seen_place``), the level after it was fused, how far measurements had moved the vehicle north,
-    east and down, the mean place after it [m] and the variances of the vehicle's velocity before it [m^2/s^2], and
-    ``log_det``: logarithm of the determinant of the innovation's covariance.
+    east and down, the mean place after it [m], the variances of the vehicle's velocity before it and the summed squares
+    of what measurements had changed it by [m^2/s^2], and ``log_det``: logarithm of the determinant of the innovation's
+    covariance.
     """
 
     ints: Int
@@ -207,7 +208,8 @@ class FilterState:
     ``clock`` holds the state's time, the last inertial sample's and the start's [ns]; ``imu`` that sample;
     ``scatter`` the vibration measure (2), the mean squared rotation and when a learned heave was last let go [s since
     the start]; ``memory`` what is remembered of each sensor; ``motion`` the parameters of the deck's motion
-    (``estimation.deck``), ``moved`` how far measurements have moved the vehicle, NED (3,) [m].
+    (``estimation.deck``), ``moved`` (6,) how far measurements have moved the vehicle, NED [m], and the summed
+    squares of what they have changed its velocity by [m^2/s^2].
     """
 
     clock: Int

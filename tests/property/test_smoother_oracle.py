@@ -86,7 +86,7 @@ def test_a_point_mass_is_smoothed_as_by_filterpy(name: str) -> None:
         np.zeros(3),
         np.zeros((64, MEMORY_SIZE)),
         np.zeros(MOTION_SIZE),
-        np.zeros(3),
+        np.zeros(6),
     )
     rows = point_mass_flight(p)
     engine = start(name, p, layout, state)

@@ -94,23 +94,24 @@ def test_steps_of_the_vehicles_own_place_are_no_sea_and_its_drift_is_none_of_the
 
 def wandering(
     accel_noise: float, readings: list[tuple[Array, float]], rng: np.random.Generator
-) -> tuple[Array, float]:
+) -> tuple[Array, float, float]:
     """Return what inertia alone makes, in 80 s at 20 Hz, of a place that a filter of place and velocity holds with
-    readings at 5 Hz, and the variance of its velocity at the end."""
+    readings at 5 Hz, the variance of its velocity at the end and the squares of its corrections in a second."""
     dt = 0.05
     F = np.array([[1.0, dt], [0.0, 1.0]])
     Q = accel_noise**2 * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
     root, P, error = np.linalg.cholesky(Q), 0.01 * np.eye(2), np.zeros(2)
-    moved, out = 0.0, np.empty(2000)
+    moved, corrected, out = 0.0, 0.0, np.empty(2000)
     for k in range(2000):
         error, P = F @ error + root @ rng.standard_normal(2), F @ P @ F.T + Q
         for h, sigma in readings if k % 4 == 0 else []:
             gain = P @ h / (h @ P @ h + sigma**2)
             correction = gain * (sigma * rng.standard_normal() - h @ error)
             error, moved = error + correction, moved + correction[0]
+            corrected += correction[1] ** 2 if k >= 400 else 0.0
             P = P - np.outer(gain, h @ P)
         out[k] = error[0] - moved
-    return out[400:], float(P[1, 1])
+    return out[400:], float(P[1, 1]), corrected / 80.0
 
 
 @pytest.mark.parametrize(
@@ -128,11 +129,11 @@ def test_the_wander_of_a_series_has_the_density_that_its_velocitys_variance_tell
     f = np.fft.rfftfreq(1600, 0.05)[1:]
     density = np.zeros(len(f))
     for _ in range(30):
-        series, variance = wandering(accel_noise, readings, rng)
+        series, variance, corrected = wandering(accel_noise, readings, rng)
         y = fast_part(0.05 * np.arange(1600), series)
         line = np.fft.rfft(taper * (y - y.mean()))[1:]
         density += 2.0 * np.abs(line) ** 2 * 0.05 / (taper @ taper) / 30
-    share = density / inertial_wander(variance, accel_noise, 0.0, f)
+    share = density / inertial_wander(variance, corrected, accel_noise, 0.0, f)
     for low, high in ((0.07, 0.1), (0.1, 0.2), (0.2, 0.4), (0.4, 0.8)):
         assert 0.5 < share[(f >= low) & (f < high)].mean() < 2.0
 
