@@ -61,7 +61,12 @@ def _add_field(out: bytearray, definition: Definition, item: Field, value: Any, 
         if count:
             _align(out, code.itemsize)
         raw = isinstance(given, bytes | bytearray | memoryview) and code.itemsize == 1
-        out += bytes(given) if raw else np.asarray(given).astype(code).tobytes()
+        if raw:
+            out += bytes(given)
+        elif isinstance(given, np.ndarray):
+            out += given.astype(code).tobytes()
+        else:  # of the field's own type at once: between small and large integers NumPy would go through floats
+            out += np.array(given, dtype=code).tobytes()
         return
     for index, element in enumerate(given):
         _add_single(out, definition, item.type, element, f"{path}[{index}]")

@@ -180,3 +180,12 @@ def test_a_stamp_beyond_2038_is_refused() -> None:
     fixed = layout(definition, Columns(np.dtype([]), {}))
     with pytest.raises(LayoutError, match="2038"):
         fixed.pack(np.array([2**31 * 10**9]), np.zeros(1, dtype=fixed.row_dtype))
+
+
+def test_integers_of_a_sequence_keep_all_their_bits_and_must_fit() -> None:
+    for values in ([0, 2**63 + 1], [-1, 2**63 - 1]):
+        kind = "uint64" if values[0] == 0 else "int64"
+        got = encode(parse("pkg/msg/Sequence", f"{kind}[] f0"), {"f0": values})
+        assert np.frombuffer(got[-16:], dtype=kind).tolist() == values
+    with pytest.raises(LayoutError, match="'f0' cannot hold"):
+        encode(parse("pkg/msg/Sequence", "uint8[] f0"), {"f0": [300]})
