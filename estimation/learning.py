@@ -164,7 +164,7 @@ class MotionLearner:
         level = self._drift(seen[now, 6])
         height = seen[now, 0] - level + fast_part(t[now], level + seen[now, 9])
         sigma = np.sqrt(seen[now, 1])
-        wander = self._wander(t[now], seen[now], 2)
+        wander = self._wander(t[now], seen[now], DOWN)
         self.model = fit(t[now], height, sigma, window_s=self.window_s, previous=self.model, wander=wander)
         if self.model.method == "bhr":
             self._take(HEAVE, self.model)
@@ -184,7 +184,7 @@ class MotionLearner:
         return self.model
 
     def _wander(self, t_s: Array, seen: Array, axis: int) -> Density:
-        """Return the density of the wander of what was seen (n, 18): north, east or down (``inertial_wander``)."""
+        """Return the density of the wander of what was seen (n, 18) along an axis: north, east, down."""
         corrected = np.maximum(np.diff(seen[:, 15 + axis]), 0.0).sum() / (t_s[-1] - t_s[0])
         tilt_noise = 0.0 if axis == DOWN else self.gyro_noise
         variance = float(seen[:, 12 + axis].mean())
