@@ -148,7 +148,7 @@ def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
                 velocity[2] -= max(0.0, deck_rate_ahead(e, seen.forecast, c.response_s))
         return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.track_tilt_rad, aim, nan, nan)
     velocity = np.empty(3)
-    velocity[:2] = sway_ahead(e, seen.forecast, c.response_level_s)
+    velocity[:2] = deck_velocity_ahead(e, seen.forecast, c.response_level_s)
     velocity[:2] += p.drift_mps
     velocity[:2] += _towards(-e.deck[:2], c.speed_mps, c.follow_gain, FOLLOW_MPS2)
     if p.mode is not Mode.LANDING:
@@ -194,7 +194,7 @@ def deck_rate_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) 
     return float(e.deck[7]) if forecast is None else forecast.rate_at(ahead_s)[0]
 
 
-def sway_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) -> Array:
+def deck_velocity_ahead(e: Estimate, forecast: DeckForecast | None, ahead_s: float) -> Array:
     """Return the deck's horizontal velocity (2,) [m/s] as it will be when the vehicle has followed the set-point."""
     now: Array = e.velocity_mps[:2] - e.deck[3:5]
     return now.copy() if forecast is None else forecast.velocity_at(ahead_s)
