@@ -101,6 +101,18 @@ def probably_inside(e: Estimate, radius: float, ahead_s: float = 0.0) -> float:
     return inside_probability(e.deck[:2] + ahead_s * e.deck[3:5], covariance, radius)
 
 
+def probably_met(e: Estimate, c: LandingConfig) -> float:
+    """Return the probability that the vehicle stands on the deck before it can answer to a set-point: that the relative
+    velocity carries it there within ``response_s``.
+    """
+    P = e.deck_covariance
+    left = -float(e.deck[2]) - c.gear_m - c.response_s * float(e.deck[5])
+    variance = float(P[2, 2] + 2.0 * c.response_s * P[2, 5] + c.response_s**2 * P[5, 5])
+    if variance <= 0.0:
+        return float(left < 0.0)
+    return 0.5 * math.erfc(left / math.sqrt(2.0 * variance))
+
+
 def tilt_rad(e: Estimate) -> float:
     """Return the angle [rad] between the vehicle's vertical and the world's."""
     return math.acos(max(-1.0, min(1.0, float(quat_to_matrix(e.quaternion)[2, 2]))))

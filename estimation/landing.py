@@ -25,6 +25,7 @@ from estimation.guidance import (
     decide,
     heading_rad,
     probably_inside,
+    probably_met,
     probably_quiet,
     search_altitude_m,
     tilt_rad,
@@ -152,11 +153,11 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
         return _abort(p, Reason.TILTED, seen)
     fall_s = time_to_contact(c.hold_height_m, c)
     if p.descent_ns is not None:
-        # So near that the vehicle could not answer before it stands, it is not led up again for its place. What is
-        # judged until then is the place at contact, as far ahead as an answer takes.
-        committed = height - c.gear_m < c.touchdown_rate_mps * c.response_s
+        # Judged is the place at contact, as far ahead as an answer takes. A vehicle that stands before it has answered
+        # more probably than not, or more probably than it stands outside, is not led up again for its place.
         inside = probably_inside(e, c.r_land_m, min(time_to_contact(height, c), c.response_s))
-        if inside < c.abort_probability and not committed:
+        met = probably_met(e, c)
+        if inside < min(c.abort_probability, 1.0 - met) and met < 0.5:
             if height <= c.blind_height_m:
                 return _abort(p, Reason.OUTSIDE_R_LAND, seen)
             return replace(p, descent_ns=None, met_ns=None, reason=Reason.OUTSIDE_R_LAND)
