@@ -35,6 +35,8 @@ SETTLING_S = 5.0
 """The platform is judged from so long after its first fix."""
 DRIFT_S = 20.0
 """What changes more slowly than this is level and drift, not heave: a running mean over so long."""
+ARRIVED_S = 0.5
+"""The deck's height is known from so long after the first fix: fixes arrive later than what they show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,19 +134,32 @@ def height_seen_later(run: Run, reach_s: float = 0.5) -> Column | None:
         return None
     last = np.searchsorted(times, run.t_ns, side="right") - 1
     seen = (last >= 0) & (run.t_ns - times[last.clip(0)] <= reach_s * 1e9)
+    seen &= run.t_ns >= _level_known_ns(times)
     return column(run.t_ns[seen], run.deck[seen, 6:7])
 
 
 def true_height(run: Run, platform: Trajectory) -> Column | None:
-    """Return the true height of the deck (up) on the estimates' level.
+    """Return the true height of the deck (up) on the estimates' level; None where the deck was never seen.
 
     The height above the origin is known to within the drift of GPS and barometer, of which no forecast can know: the
-    truth is shifted by the running mean of its difference to the estimate.
+    truth is shifted by the running mean of its difference to the estimate. Only what was estimated with a fix counts
+    in it: before the first one the estimate knows no level.
     """
-    if platform.position_m is None or not run.deck.shape[1]:
+    times = fused_fixes_ns(run)
+    if platform.position_m is None or not run.deck.shape[1] or not len(times):
         return None
     up = -platform.position_m.at(run.t_ns)[:, 2]
-    return column(run.t_ns, (up + slow(run.t_ns, run.deck[:, 6] - up))[:, None])
+    known = (run.t_ns >= _level_known_ns(times)) & np.isfinite(up)
+    if not known.any():
+        return None
+    shift = slow(run.t_ns, np.where(known, run.deck[:, 6] - up, np.nan))
+    first = int(np.argmax(known))
+    shift[:first] = shift[first]
+    return column(run.t_ns, (up + shift)[:, None])
+
+
+def _level_known_ns(fused_ns: Times) -> int:
+    return int(fused_ns[0]) + round(ARRIVED_S * 1e9)
 
 
 def slow(t_ns: Times, values: Array, over_s: float = DRIFT_S) -> Array:

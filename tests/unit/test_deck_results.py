@@ -12,9 +12,9 @@ from small_flight import BOOT, COMPANION_AHEAD_NS, HEAVE_M, HEAVE_S, deck_down_m
 
 import deckfix
 from deckfix.commands import finite
-from deckfix.deck_reference import fused_fixes_ns, height_seen_later, slow
+from deckfix.deck_reference import ARRIVED_S, fused_fixes_ns, height_seen_later, slow, true_height
 from deckfix.forecasts import HORIZONS_S, Forecasts, judge
-from deckfix.reference import Column
+from deckfix.reference import Column, Trajectory, column
 from deckfix.result import Result
 from estimation.config import parse_config
 from logs.writer import FlightWriter
@@ -59,8 +59,26 @@ def test_the_height_that_was_seen_begins_with_the_first_fix(result: Result) -> N
     run = replace(result.run, records=records[records["t_ns"] > result.run.t_ns[0] + 3_000_000_000])
     height, fixes = height_seen_later(run), fused_fixes_ns(run)
     assert height is not None and fixes[0] > run.t_ns[0] + 3_000_000_000
-    assert height.t_ns[0] == run.t_ns[np.searchsorted(run.t_ns, fixes[0])]
-    assert np.all(np.isin(run.t_ns[run.t_ns > fixes[0]], height.t_ns))
+    known = fixes[0] + round(ARRIVED_S * 1e9)
+    assert height.t_ns[0] == run.t_ns[np.searchsorted(run.t_ns, known)]
+    assert np.all(np.isin(run.t_ns[run.t_ns > known], height.t_ns))
+
+
+def test_the_truth_is_put_on_the_level_that_fixes_told(result: Result) -> None:
+    """The prior's level, metres away, moves neither the truth before the first fix nor that of the seconds after."""
+    records = result.run.records
+    late = result.run.t_ns[0] + 3_000_000_000
+    deck = result.run.deck.copy()
+    deck[result.run.t_ns <= late, 6] = 0.0
+    deck[result.run.t_ns > late, 6] = 5.0
+    run = replace(result.run, records=records[records["t_ns"] > late], deck=deck)
+    down = np.zeros((len(run.t_ns), 3))
+    position = column(run.t_ns, down)
+    assert position is not None
+    height = true_height(run, Trajectory(position, None, None))
+    assert height is not None
+    assert np.allclose(height.at(run.t_ns)[:, 0], 5.0)
+    assert true_height(replace(run, records=records[:0]), Trajectory(position, None, None)) is None
 
 
 def test_raw_fixes_are_shown_in_the_same_frame(result: Result) -> None:
