@@ -141,7 +141,7 @@ def test_above_the_blind_height_the_place_is_corrected_and_the_quiet_moment_wait
 
 @pytest.mark.parametrize(("closing_mps", "stays"), [(0.25, True), (0.0, False)])
 def test_what_stands_before_it_could_be_led_up_stays(closing_mps: float, stays: bool) -> None:
-    """At the touchdown's rate the last two centimetres take less than the answer; at rest over the deck it can climb."""
+    """The last two centimetres take less than the answer at the touchdown's rate; from rest it can climb."""
     near = estimate(10**9, (0.6, 0.0, -0.12))
     near.deck[5] = closing_mps
     p, said = step(landing(), Situation(10**9, near, 0.1), LandingConfig())
