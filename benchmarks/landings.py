@@ -30,8 +30,8 @@ import numpy as np
 from joblib import Parallel, delayed
 from targets import Target, Targets, provenance
 
-from estimation.config import LandingConfig
 from estimation.landing import step
+from estimation.landing_config import LandingConfig
 from estimation.modes import Decision, Mode, Progress, Reason, Situation
 from simulation.flight import WavesTable
 from simulation.mission import Mission, load_mission

@@ -15,8 +15,8 @@ import numpy as np
 from deckfix.landing_target import Newest
 from deckfix.mavlink_link import GUIDED, Vehicle
 from estimation.ahead import DeckForecast
-from estimation.config import LandingConfig
 from estimation.landing import step
+from estimation.landing_config import LandingConfig
 from estimation.modes import EXPLANATIONS, Decision, Mode, Progress, Situation
 
 LOCAL_NED = 1

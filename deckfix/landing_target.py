@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from estimation.config import LandingConfig
 from estimation.frames import Array, quat_exp, quat_multiply, quat_to_matrix
+from estimation.landing_config import LandingConfig
 from estimation.output import Estimate
 
 BODY_FRD = 12

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimation.ahead import DeckForecast
-from estimation.config import LandingConfig
 from estimation.frames import Array, quat_to_matrix
+from estimation.landing_config import LandingConfig
 from estimation.modes import Decision, Mode, Progress, Reason, Situation
 from estimation.state import PL0
 

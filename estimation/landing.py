@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimation.config import LandingConfig
 from estimation.guidance import (
     decide,
     heading_rad,
@@ -32,6 +31,7 @@ from estimation.guidance import (
     time_to_contact,
     unfit,
 )
+from estimation.landing_config import LandingConfig
 from estimation.modes import Decision, Mode, Progress, Reason, Situation
 from estimation.state import PL0
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimation.config import VisionConfig
 from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, quat_exp, quat_to_matrix
+from estimation.sensor_config import VisionConfig
 from simulation.flight import deck_axes
 from simulation.instruments import Instant
 from simulation.mission import Mission

@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.config import VisionConfig
 from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_exp, quat_to_matrix
+from estimation.sensor_config import VisionConfig
 from estimation.update import MAX_LATENCY_S
 from simulation.jets import Array
 from simulation.trajectory import Trajectory

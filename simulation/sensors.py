@@ -27,9 +27,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.config import Config, GpsConfig
+from estimation.config import Config
 from estimation.events import AUTOPILOT, CAMERA, COMPANION, EVENT_DTYPE, EventBatch, Kind
 from estimation.frames import ned_to_geodetic, quat_exp, quat_multiply
+from estimation.sensor_config import GpsConfig
 from simulation.fixes import CameraErrors, View, draw_fixes
 from simulation.jets import Array
 from simulation.trajectory import Motion, Trajectory

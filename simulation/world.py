@@ -17,11 +17,11 @@ from typing import Protocol
 import numpy as np
 
 from estimation.ahead import DeckForecaster
-from estimation.config import LandingConfig
 from estimation.estimator import EngineName, LandingEstimator
 from estimation.events import AUTOPILOT, EventBatch, Kind
 from estimation.frames import Array, normal_gravity, quat_conjugate, quat_multiply, quat_to_matrix
 from estimation.landing import step
+from estimation.landing_config import LandingConfig
 from estimation.modes import Decision, Mode, Progress, Reason, Situation
 from estimation.output import Estimate, Facts
 from simulation import vehicle as body

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimation.ahead import DeckForecast
-from estimation.config import LandingConfig
 from estimation.frames import euler_to_quat
 from estimation.guidance import deck_rate_ahead, inside_probability, search_altitude_m, time_to_contact
 from estimation.landing import step
+from estimation.landing_config import LandingConfig
 from estimation.modes import EXPLANATIONS, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
 from estimation.state import NOMINAL_SIZE, Q0

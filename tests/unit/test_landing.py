@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimation.ahead import DeckForecast
-from estimation.config import Config, ConfigError, LandingConfig, parse_config
+from estimation.config import Config, ConfigError, parse_config
 from estimation.frames import euler_to_quat
 from estimation.guidance import (
     FOLLOW_MPS2,
@@ -19,6 +19,7 @@ from estimation.guidance import (
     time_to_contact,
 )
 from estimation.landing import step
+from estimation.landing_config import LandingConfig
 from estimation.modes import EXPLANATIONS, Decision, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
 from estimation.state import NOMINAL_SIZE

@@ -15,8 +15,8 @@ from deckfix.guide import Guide, set_point
 from deckfix.health import WORDS, Health, Problem
 from deckfix.landing_target import AHEAD_S, Newest, landing_target, target_in_body, why_not
 from deckfix.mavlink_link import GUIDED, LAND, Vehicle
-from estimation.config import LandingConfig
 from estimation.frames import euler_to_quat, quat_to_matrix
+from estimation.landing_config import LandingConfig
 from estimation.modes import Mode
 from estimation.output import Estimate
 from estimation.state import NOMINAL_SIZE
