@@ -36,10 +36,17 @@ from estimation.rows import (
     HEAVE_MODEL,
     KIND,
     LATE,
+    LOG_DET,
     OUTCOME,
     OWN,
     RESET,
     RESULT,
+    SEEN,
+    SEEN_CORRECTED,
+    SEEN_DOUBT,
+    SEEN_LEVEL,
+    SEEN_MOVED,
+    SEEN_PLACE,
     SENSOR,
     STAMP_NS,
     T_NS,
@@ -84,6 +91,8 @@ _FUSED_LATE = int(Outcome.FUSED_LATE)
 _DOWNWEIGHTED = int(Outcome.DOWNWEIGHTED)
 _REJECTED_GATE = int(Outcome.REJECTED_GATE)
 _IMU = 0
+_SEEN = SEEN - RESULT
+_LOG_DET = LOG_DET - RESULT
 
 
 def _transited(F: Array, P: Array, span: Int) -> Array:
@@ -209,12 +218,12 @@ def _fuse(
     result[0] = nis
     result[1] = m
     if kind == VISION:
-        seen_place(r, R, x, p, result[8:14])
-        result[15:18] = moved[:3]
+        seen_place(r, R, x, p, result[_SEEN : _SEEN + SEEN_LEVEL])
+        result[_SEEN + SEEN_MOVED : _SEEN + SEEN_PLACE] = moved[:3]
         for j in range(3):
-            result[20 + j] = P[V0 + j, V0 + j]
-        result[23:26] = moved[3:]
-    result[26] = math.log(determinant(S, m))
+            result[_SEEN + SEEN_DOUBT + j] = P[V0 + j, V0 + j]
+        result[_SEEN + SEEN_CORRECTED : _LOG_DET] = moved[3:]
+    result[_LOG_DET] = math.log(determinant(S, m))
     w = weight(nis, m, p)
     outcome = _FUSED_LATE if late else _FUSED
     mark = 0
@@ -245,8 +254,8 @@ def _fuse(
     att = offsets[ATTITUDE]
     reset_attitude(P, right_jacobian(error[att : att + 3]), att)
     x = plus(x, error, offsets)
-    result[14] = x[PL0]
-    result[18:20] = x[PO0 : PO0 + 2]
+    result[_SEEN + SEEN_LEVEL] = x[PL0]
+    result[_SEEN + SEEN_PLACE : _SEEN + SEEN_DOUBT] = x[PO0 : PO0 + 2]
     if stop > 0:
         for i in range(first, stop):
             for j in range(first, stop):

@@ -19,7 +19,17 @@ from estimation.deck import HEAVE, deck_output, seen_place, take_up
 from estimation.frames import Array
 from estimation.outcome import Outcome
 from estimation.relinearise import moved_far, relinearise
-from estimation.rows import HEAVE_MODEL, Estimates, FilterState, Rows
+from estimation.rows import (
+    HEAVE_MODEL,
+    SEEN_CORRECTED,
+    SEEN_DOUBT,
+    SEEN_LEVEL,
+    SEEN_MOVED,
+    SEEN_PLACE,
+    Estimates,
+    FilterState,
+    Rows,
+)
 from estimation.state import ATTITUDE, P0, PL0, PO0, V0, Layout, plus
 from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.watch import LET_GO, let_go, unexplained
@@ -172,9 +182,9 @@ class FilterPyEngine:
         rows.log_det[i] = np.linalg.slogdet(S)[1]
         if kind == models.VISION:
             seen_place(r, R, s.x, self.p, rows.seen[i])
-            rows.seen[i, 7:10] = s.moved[:3]
-            rows.seen[i, 12:15] = np.diag(s.P)[V0 : V0 + 3]
-            rows.seen[i, 15:18] = s.moved[3:]
+            rows.seen[i, SEEN_MOVED:SEEN_PLACE] = s.moved[:3]
+            rows.seen[i, SEEN_DOUBT:SEEN_CORRECTED] = np.diag(s.P)[V0 : V0 + 3]
+            rows.seen[i, SEEN_CORRECTED:] = s.moved[3:]
         w = update.weight(nis, m, self.p)
         if kind == models.VISION and unexplained(memory, t_s, r, S, w, s.x, self.p, s.motion):
             rows.reset[i] = LET_GO
@@ -199,8 +209,8 @@ class FilterPyEngine:
             error = self._update(r, H, R / w)
             error[first:stop] = 0.0
         s.x = plus(s.x, error, self.layout.offsets)
-        rows.seen[i, 6] = s.x[PL0]
-        rows.seen[i, 10:12] = s.x[PO0 : PO0 + 2]
+        rows.seen[i, SEEN_LEVEL] = s.x[PL0]
+        rows.seen[i, SEEN_PLACE:SEEN_DOUBT] = s.x[PO0 : PO0 + 2]
         P = ekf.P
         att = int(self.layout.offsets[ATTITUDE])
         G = models.right_jacobian(error[att : att + 3])

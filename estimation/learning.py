@@ -22,7 +22,7 @@ from estimation.heave.bandpass import BandPass
 from estimation.heave.model import HeaveModel, fit
 from estimation.heave.spectrum import Density
 from estimation.outcome import Outcome
-from estimation.rows import Rows
+from estimation.rows import SEEN_CORRECTED, SEEN_DOUBT, SEEN_LEVEL, SEEN_MOVED, SEEN_PLACE, Rows
 from estimation.watch import LET_GO
 
 LEAST_S = 8.0
@@ -50,6 +50,7 @@ DRIFT_PRIOR = 4.0
 """Weight of the speed that is expected of the drift, in velocities seen: half a minute shows two, on both axes."""
 DOWN = 2
 """Of north, east and down the axis that no tilt brings gravity into."""
+GRAVITY_MPS2 = 9.81
 STILL_M = 0.01
 """Smallest 1-sigma that a platform is believed to move with [m]."""
 SEA_RADPS = (0.44, 5.0)
@@ -133,8 +134,10 @@ class MotionLearner:
             if not self._t_ns or t_ns - self._t_ns[-1] > GAP_S * 1e9:
                 self._settled_ns = t_ns + int(SETTLING_S * 1e9)
             self._t_ns.append(t_ns)
-            unsettled = [*seen[:6], math.nan, *seen[7:10], math.nan, math.nan, *seen[12:]]
-            self._seen.append(seen if t_ns >= self._settled_ns else unsettled)
+            if t_ns < self._settled_ns:
+                for mean in (SEEN_LEVEL, SEEN_PLACE, SEEN_PLACE + 1):
+                    seen[mean] = math.nan
+            self._seen.append(seen)
 
     def _drift(self, mean: Array) -> Array:
         """Return how far a mean (n,), the level or a coordinate of the place, was at each fix from what it is at the
@@ -161,8 +164,8 @@ class MotionLearner:
         now = slice(0 if self._begin_ns is None else int(np.searchsorted(self._t_ns, self._begin_ns)), None)
         if len(t[now]) < 2 or t[-1] - t[now][0] < LEAST_S:
             return None
-        level = self._drift(seen[now, 6])
-        height = seen[now, 0] - level + fast_part(t[now], level + seen[now, 9])
+        level = self._drift(seen[now, SEEN_LEVEL])
+        height = seen[now, 0] - level + fast_part(t[now], level + seen[now, SEEN_MOVED + DOWN])
         sigma = np.sqrt(seen[now, 1])
         wander = self._wander(t[now], seen[now], DOWN)
         self.model = fit(t[now], height, sigma, window_s=self.window_s, previous=self.model, wander=wander)
@@ -172,7 +175,7 @@ class MotionLearner:
         self._count += 1
         if axis < len(self.sway):
             place, sigma = seen[:, 2 + 2 * axis], np.sqrt(seen[:, 3 + 2 * axis])
-            mean, moved = self._drift(seen[:, 10 + axis]), seen[:, 7 + axis]
+            mean, moved = self._drift(seen[:, SEEN_PLACE + axis]), seen[:, SEEN_MOVED + axis]
             swing = place - mean + fast_part(t, mean - moved)
             wander = self._wander(t, seen, axis)
             model = fit(t, swing, sigma, window_s=self.window_s, previous=self.sway[axis], wander=wander)
@@ -185,9 +188,9 @@ class MotionLearner:
 
     def _wander(self, t_s: Array, seen: Array, axis: int) -> Density:
         """Return the density of the wander of what was seen (n, 18) along an axis: north, east, down."""
-        corrected = np.maximum(np.diff(seen[:, 15 + axis]), 0.0).sum() / (t_s[-1] - t_s[0])
+        corrected = np.maximum(np.diff(seen[:, SEEN_CORRECTED + axis]), 0.0).sum() / (t_s[-1] - t_s[0])
         tilt_noise = 0.0 if axis == DOWN else self.gyro_noise
-        variance = float(seen[:, 12 + axis].mean())
+        variance = float(seen[:, SEEN_DOUBT + axis].mean())
         return partial(inertial_wander, variance, float(corrected), self.accel_noise, tilt_noise)
 
     def _drift_speed(self) -> float:
@@ -253,7 +256,7 @@ def inertial_wander(
     gravity, adds to n^2 (derived in docs/concepts.md).
     """
     omega = 2.0 * math.pi * frequency_hz
-    noise = 0.5 * (accel_noise**2 + corrected) + (9.81 * gyro_noise / omega) ** 2
+    noise = 0.5 * (accel_noise**2 + corrected) + (GRAVITY_MPS2 * gyro_noise / omega) ** 2
     band = math.sqrt(2.0) * noise / velocity_variance
     density = 4.0 * noise * (omega**2 + band**2) / (omega**2 * (omega**4 + band**4))
     return np.asarray(density * (1.0 - np.exp(-0.5 * (omega * SLOW_SIGMA_S) ** 2)) ** 2)

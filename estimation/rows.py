@@ -23,6 +23,8 @@ PENDING = -1
 T_NS, KIND, SENSOR, ID, LATE, STAMP_NS, ARRIVAL_NS, AGE_NS, OUTCOME, RESET = range(10)
 """Columns of ``Rows.ints``."""
 VALUE, OWN, RESULT, SEEN, LOG_DET, FLOATS = 0, 6, 12, 20, 38, 39
+SEEN_LEVEL, SEEN_MOVED, SEEN_PLACE, SEEN_DOUBT, SEEN_CORRECTED = 6, 7, 10, 12, 15
+"""Where in ``Rows.seen`` what belongs to a fix begins, behind what it shows."""
 """First columns in ``Rows.floats``, and their number."""
 HEAVE_MODEL = 10
 """Kind of a row that is no measurement: from here on a chain of the platform's motion has the parameters in ``value``
@@ -127,7 +129,8 @@ class Rows:
     @property
     def seen(self) -> Array:
         """Height, north and east of the deck as a fix shows it [m], each with its variance; the level after it; how far
-        measurements had moved the vehicle north, east and down; the mean place after it.
+        measurements had moved the vehicle north, east and down; the mean place after it; the variance of the vehicle's
+        velocity, and the sum of squares of what measurements had added to it, north, east and down. (n, 18)
         """
         return self.floats[:, SEEN:LOG_DET]
 
