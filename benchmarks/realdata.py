@@ -38,7 +38,7 @@ RTK_SIGMA_M = (0.02, 0.04)
 def data_folder() -> Path | None:
     """Return the folder of real recordings ($DECKFIX_DATA, or shared/data beside the repository), if it exists."""
     beside = Path(__file__).parents[2] / "shared" / "data"
-    folder = Path(os.environ.get("DECKFIX_DATA", beside))
+    folder = Path(os.environ.get("DECKFIX_DATA") or beside)
     return folder if folder.is_dir() else None
 
 
