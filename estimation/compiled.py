@@ -7,7 +7,7 @@ and caches the machine code under the user's cache folder, keyed by the sources:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from estimation.algebra import (
 )
 from estimation.band import BAND_SIZE
 from estimation.codecache import jitted
-from estimation.deck import HEAVE, deck_output, seen_place, take_up
+from estimation.deck import HEAVE, deck_output, no_steps, seen_place, take_up
 from estimation.frames import Array
 from estimation.models import BAROMETER, VISION, measure, right_jacobian, transition
 from estimation.outcome import Outcome
@@ -174,7 +174,7 @@ def _spans(layout: Layout) -> Int:
 
 def _propagate(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, t: int, t_imu: int, imu: Array, p: Array,
-    offsets: Offsets, F: Array, Q: Array, motion: Array, span: Int, chain: Array,
+    offsets: Offsets, F: Array, Q: Array, motion: Array, keys: Array, kept: Array, span: Int, chain: Array,
 ) -> Array:  # fmt: skip
     total = t - clock[0]
     if total <= 0:
@@ -186,7 +186,7 @@ def _propagate(
     for k in range(steps):
         middle = a + total * ((k + 0.5) / steps)
         mean = interpolate(imu0, clock[1], imu, t_imu, middle)
-        x = transition(x, mean[:3], mean[3:], dt, extra, p, offsets, F, Q, motion)
+        x = transition(x, mean[:3], mean[3:], dt, extra, p, offsets, F, Q, motion, keys, kept)
         _propagate_covariance(P, F, Q, span)
         if chain.shape[0] > 0:
             chain[:, :] = _transited(F, chain, span)
@@ -289,7 +289,8 @@ register_jitable(_fuse)
 
 def _advance(
     clock: Int, x: Array, P: Array, imu0: Array, scatter: Array, memory: Array, motion: Array, moved: Array,
-    p: Array, offsets: Offsets, span: Int, ints: Int, floats: Array, start: int, stop: int, out_t: Int, out_x: Array,
+    keys: Array, kept: Array, p: Array, offsets: Offsets, span: Int, ints: Int, floats: Array, start: int,
+    stop: int, out_t: Int, out_x: Array,
     out_sigma: Array, out_covariance: Array, out_deck: Array, out_deck_covariance: Array, count: int,
     emit_after_ns: int, period_ns: int, trail_count: Int, trail_t: Int, trail_marks: Int, trail_x: Array,
     trail_P: Array, trail_chain: Array, trail_motion: Array,
@@ -313,7 +314,7 @@ def _advance(
         if recording:
             chain = trail_chain[trail_count[0]]
         state = _propagate(
-            clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, motion, span, chain
+            clock, state, P, imu0, scatter, t, t_imu, imu, p, offsets, F, Q, motion, keys, kept, span, chain
         )
         if ints[i, KIND] == HEAVE_MODEL:
             ints[i, OUTCOME] = _FUSED
@@ -388,6 +389,7 @@ class CompiledEngine:
     state: FilterState
     span: Int
     trail: Trail
+    steps: tuple[Array, Array] = field(default_factory=no_steps)
 
     @classmethod
     def start(cls, p: Array, layout: Layout, state: FilterState) -> CompiledEngine:
@@ -408,8 +410,9 @@ class CompiledEngine:
         """Process the rows start..stop in order; see ``FilterPyEngine.advance``."""
         s, trail = self.state, self.trail
         out.count = _kernel(
-            s.clock, s.x, s.P, s.imu, s.scatter, s.memory, s.motion, s.moved, self.p, self.layout.offsets, self.span,
-            rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma, out.covariance, out.deck,
-            out.deck_covariance, out.count, emit_after_ns, period_ns, trail.count, trail.t_ns, trail.marks,
+            s.clock, s.x, s.P, s.imu, s.scatter, s.memory, s.motion, s.moved, *self.steps, self.p,
+            self.layout.offsets, self.span, rows.ints, rows.floats, start, stop, out.t_ns, out.x, out.sigma,
+            out.covariance, out.deck, out.deck_covariance, out.count, emit_after_ns, period_ns, trail.count,
+            trail.t_ns, trail.marks,
             trail.nominal, trail.covariance, trail.chain, trail.motion,
         )  # fmt: skip

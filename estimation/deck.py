@@ -60,6 +60,9 @@ ANY_SEA = np.array([1.0 / 1.6, 1.0, 1.6])
 wind sea and swell both lie within what it expects."""
 DRIFT_TIME_S = 10.0
 """Correlation time of the velocity with which the place drifts: a sixth of the minute that a mooring swings in [s]."""
+STEPS_KEPT = 61
+"""Steps of different length whose transitions are remembered: more than lie in a window of late events; a prime, so
+that whole milliseconds do not share a place."""
 OUTPUT_SIZE = 8
 """Relative position (3), relative velocity (3), height and its rate."""
 
@@ -122,10 +125,38 @@ def take_up(
     motion[DRIFT_SPEED] = own[2]
 
 
+def no_steps() -> tuple[Array, Array]:
+    """Return room for what chains do over a step, with nothing in it: keys (61, 22), values (61, 2, 3, 6, 6).
+
+    Steps come again, since the inertial sample's period hardly varies and late events are propagated to anew; a key is
+    dt and the motion's parameters, a value the transitions and the noises of the three chains.
+    """
+    chains = len(CHAINS)
+    keys = np.zeros((STEPS_KEPT, 1 + DRIFT_SPEED))
+    return keys, np.zeros((STEPS_KEPT, 2, chains, BAND_SIZE, BAND_SIZE))
+
+
+def kept_step(dt: float, motion: Array, keys: Array, kept: Array) -> int:
+    """Return the place in ``kept`` of the chains' transitions and noises over ``dt`` [s], put there if they are not."""
+    k = int(dt * 1e9 + 0.5) % STEPS_KEPT
+    if keys[k, 0] != dt or np.any(keys[k, 1:] != motion[:DRIFT_SPEED]):
+        keys[k, 0] = dt
+        keys[k, 1:] = motion[:DRIFT_SPEED]
+        for c in range(len(CHAINS)):
+            transition, noise = discrete_band(motion[CHAINS[c] : CHAINS[c] + BAND_PARAMETERS], dt)
+            kept[k, 0, c] = transition
+            kept[k, 1, c] = noise
+    return k
+
+
 def deck_transition(
-    x: Array, y: Array, dt: float, p: Array, motion: Array, offsets: Offsets, F: Array, Q: Array
-) -> None:
-    """Propagate the platform's blocks from ``x`` into ``y`` over ``dt`` [s]; fill their places in F and Q."""
+    x: Array, y: Array, dt: float, p: Array, motion: Array, keys: Array, kept: Array, offsets: Offsets, F: Array,
+    Q: Array,
+) -> None:  # fmt: skip
+    """Propagate the platform's blocks from ``x`` into ``y`` over ``dt`` [s]; fill their places in F and Q.
+
+    ``keys`` and ``kept`` are those of ``no_steps``, and change.
+    """
     # The drift's velocity is a first-order Gauss-Markov process; how far its noise takes the place is a series in dt.
     time = DRIFT_TIME_S
     remains = math.exp(-dt / time)
@@ -143,13 +174,13 @@ def deck_transition(
         y[PD0 + i] = remains * x[PD0 + i]
     level = offsets[PLATFORM_LEVEL]
     Q[level, level] = p[par.LEVEL_WALK] ** 2 * dt
-    for chain in CHAINS:
-        at, start = places(chain, offsets)
+    k = kept_step(dt, motion, keys, kept)
+    for c in range(len(CHAINS)):
+        at, start = places(CHAINS[c], offsets)
         end, place_end = start + BAND_SIZE, at + BAND_SIZE
-        transition, noise = discrete_band(motion[chain : chain + BAND_PARAMETERS], dt)
-        F[start:end, start:end] = transition
-        Q[start:end, start:end] = noise
-        y[at:place_end] = product(transition, x[at:place_end])
+        F[start:end, start:end] = kept[k, 0, c]
+        Q[start:end, start:end] = kept[k, 1, c]
+        y[at:place_end] = product(kept[k, 0, c], x[at:place_end])
     latency = offsets[CAMERA_LATENCY]
     Q[latency, latency] = p[par.LATENCY_WALK] ** 2 * dt
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from estimation import models, update
-from estimation.deck import HEAVE, deck_output, seen_place, take_up
+from estimation.deck import HEAVE, deck_output, no_steps, seen_place, take_up
 from estimation.frames import Array
 from estimation.outcome import Outcome
 from estimation.relinearise import moved_far, relinearise
@@ -58,6 +58,7 @@ class FilterPyEngine:
     users: Mapping[int, Model]
     ekf: ExtendedKalmanFilter
     trail: Trail
+    steps: tuple[Array, Array] = field(default_factory=no_steps)
 
     @classmethod
     def start(
@@ -137,7 +138,7 @@ class FilterPyEngine:
             middle = a + total * ((k + 0.5) / steps)
             mean = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, middle)
             s.x = models.transition(
-                s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q, s.motion
+                s.x, mean[:3], mean[3:], dt, extra, self.p, self.layout.offsets, F, Q, s.motion, *self.steps
             )
             self.ekf.P = s.P
             self.ekf.F = F

@@ -103,12 +103,15 @@ def transition(
     F: Array,
     Q: Array,
     motion: Array,
+    keys: Array,
+    kept: Array,
 ) -> Array:
     """Propagate the nominal state over ``dt`` [s]; write the error state's transition into F and noise into Q.
 
     ``gyro`` [rad/s] and ``accel`` [m/s^2] are the raw mean over the interval; ``scatter`` holds the additional white
     noise densities squared of accelerometer [(m/s^2)^2/Hz] and gyro [(rad/s)^2/Hz]; ``motion`` are the deck's
-    parameters (22,) (``estimation.deck``), read where its blocks are on. F and Q, (n, n), are written whole. Returns
+    parameters (22,) (``estimation.deck``), read where its blocks are on; ``keys`` and ``kept`` remember what they do
+    over a step (``estimation.deck.no_steps``). F and Q, (n, n), are written whole. Returns
     the new nominal state. Strapdown in the local tangent plane; the Earth's rate is left to the gyro bias
     (docs/limits.md).
     """
@@ -170,7 +173,7 @@ def transition(
         b = offsets[BARO_BIAS]
         Q[b, b] = p[par.BARO_BIAS_WALK] ** 2 * dt
     if offsets[PLATFORM_OFFSET] >= 0:
-        deck_transition(x, y, dt, p, motion, offsets, F, Q)
+        deck_transition(x, y, dt, p, motion, keys, kept, offsets, F, Q)
     return y
 
 

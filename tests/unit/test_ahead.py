@@ -10,7 +10,7 @@ import pytest
 from estimation.ahead import DeckForecaster
 from estimation.band import band_matrix, band_stationary
 from estimation.config import parse_config
-from estimation.deck import deck_transition
+from estimation.deck import deck_transition, no_steps
 from estimation.estimator import LandingEstimator
 from estimation.parameters import Site, pack_parameters
 from estimation.state import PD0, PH0, PS0, Layout, nominal_zero
@@ -46,7 +46,7 @@ def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
     for _ in range(160):
         F, Q = np.eye(layout.size), np.zeros((layout.size, layout.size))
         y = x.copy()
-        deck_transition(x, y, 0.005, p, MOTION, layout.offsets, F, Q)
+        deck_transition(x, y, 0.005, p, MOTION, *no_steps(), layout.offsets, F, Q)
         x = y
         covariance = F[block, block] @ covariance @ F[block, block].T + Q[block, block]
     rate = band_matrix(HEAVE)[5]

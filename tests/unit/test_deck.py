@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from estimation.band import band_derivatives, band_matrix, band_moments, band_states, band_stationary
+from estimation.band import (
+    BAND_PARAMETERS,
+    band_derivatives,
+    band_matrix,
+    band_moments,
+    band_states,
+    band_stationary,
+    discrete_band,
+)
 from estimation.config import parse_config
 from estimation.deck import (
     CHAINS,
@@ -19,6 +27,8 @@ from estimation.deck import (
     change_motion,
     deck_output,
     deck_transition,
+    kept_step,
+    no_steps,
     places,
     seen_place,
     vision,
@@ -117,7 +127,7 @@ def test_the_jacobian_of_a_fix_is_its_derivative() -> None:
 def test_the_transition_is_the_exponential_of_the_chain(chain: int) -> None:
     x, y, dt = some_state(), some_state(), 0.02
     F, Q = np.eye(LAYOUT.size), np.zeros((LAYOUT.size, LAYOUT.size))
-    deck_transition(x, y, dt, P, MOTION, LAYOUT.offsets, F, Q)
+    deck_transition(x, y, dt, P, MOTION, *no_steps(), LAYOUT.offsets, F, Q)
     at, start = places(chain, LAYOUT.offsets)
     block, band = slice(start, start + 6), MOTION[chain : chain + 7]
     f, drive = band_matrix(band), np.zeros((6, 1))
@@ -245,3 +255,19 @@ def test_a_sea_of_which_only_the_heave_is_known_becomes_the_new_one(seed: int) -
     y = shown(old) @ band_stationary(old) @ shown(old).T
     wanted = G @ y @ G.T + S - G @ C @ S
     assert P[block, block] == pytest.approx(wanted, rel=1e-3, abs=1e-5 * np.abs(wanted).max())
+
+
+def test_a_step_that_is_remembered_is_that_of_its_length_and_motion() -> None:
+    """Lengths that share a place, and motions that come and go, never hear of one another."""
+    keys, kept = no_steps()
+    calmer = MOTION * np.where(np.arange(len(MOTION)) == CHAINS[1], 0.5, 1.0)
+    lengths = [0.005, 0.005 + len(keys) * 1e-9, 0.0025, 0.005]
+    for motion in (MOTION, calmer, MOTION):
+        for dt in lengths:
+            k = kept_step(dt, motion, keys, kept)
+            assert kept_step(dt, motion, keys, kept) == k
+            for c, chain in enumerate(CHAINS):
+                transition, noise = discrete_band(motion[chain : chain + BAND_PARAMETERS], dt)
+                assert np.array_equal(kept[k, 0, c], transition)
+                assert np.array_equal(kept[k, 1, c], noise)
+    assert np.count_nonzero(keys[:, 0]) == 2

@@ -11,7 +11,7 @@ from estimation import models
 from estimation import parameters as par
 from estimation.config import parse_config
 from estimation.consistency import check_jacobian
-from estimation.deck import deck_output
+from estimation.deck import deck_output, no_steps
 from estimation.frames import (
     R_CB_NOMINAL,
     Array,
@@ -126,7 +126,9 @@ def test_transition(x: Array, rate: Array, force: Array, dt: float) -> None:
     F, Q, unused = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
 
     def step(start: Array, F: Array = unused, Q: Array = unused) -> Array:
-        return models.transition(start, gyro, accel, dt, scatter, P, LAYOUT.offsets, F, Q, MOTION)
+        return models.transition(
+            start, gyro, accel, dt, scatter, P, LAYOUT.offsets, F, Q, MOTION, *no_steps()
+        )
 
     end = step(x, F, Q)
     numeric = np.empty((n, n))
@@ -155,7 +157,7 @@ def test_process_noise_composes(x: Array, dt: float) -> None:
     parts = []
     for step in (dt, 0.5 * dt):
         F, Q = np.empty((n, n)), np.empty((n, n))
-        models.transition(x, still, still, step, scatter, P, LAYOUT.offsets, F, Q, MOTION)
+        models.transition(x, still, still, step, scatter, P, LAYOUT.offsets, F, Q, MOTION, *no_steps())
         parts.append((F, Q))
     (_, whole), (F, half) = parts
     sum_of_halves = F @ half @ F.T + half
