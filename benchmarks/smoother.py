@@ -68,9 +68,8 @@ TUNED = (
     "gps.velocity_sigma_mps",
     "gps.climb_sigma_mps",
     "barometer.*",
-    "platform.drift_sigma_mps",
 )
-"""What is tuned of the simulator's flights: its receiver, its barometer and its mooring differ from real ones."""
+"""What is tuned of the simulator's flights: its receiver and its barometer are what differs from real ones."""
 RELATIVE = {"relative position [m]": "position_m", "relative velocity [m/s]": "velocity_mps"}
 PARTS: dict[str, tuple[str, tuple[int, ...]]] = {
     "horizontal position [m]": ("position_m", (0, 1)),
