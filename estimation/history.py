@@ -81,6 +81,15 @@ class History:
             return np.empty(0, dtype=np.int64)
         if place and self.rows.t_ns[place - 1] >= first:
             place = int(np.searchsorted(self.rows.t_ns[:place], first, side="left"))
+            if n == 1 and self.rows.t_ns[place] > first:
+                # One event at a time of its own, as most late ones are: nothing to put in order, nothing to repeat.
+                self._reserve(self.size + 1)
+                self.rows.make_room(place, self.size)
+                self.rows.write(place, new)
+                self.size += 1
+                self._mark_repeated(place)
+                self._go_back(place)
+                return np.empty(0, dtype=np.int64)
         merged = Rows.concatenate(self.rows.take(slice(place, self.size)), new) if place < self.size else new
         order = _order(merged)
         repeated = _repetitions(merged, order)
@@ -94,17 +103,22 @@ class History:
         self.rows.write(place, merged.take(order))
         self.size = place + len(order)
         self._mark_repeated(place)
-        if first_changed < self.done:
-            # Measurements between two inertial samples were taken with an interpolation between them, which an
-            # insertion may change: all since the sample before is done again.
-            back = first_changed
-            while back > 0 and self.rows.kind[back - 1] != IMU:
-                back -= 1
-            while self.checkpoints[-1][0] >= back:
-                self.checkpoints.pop()
-            self.done = self.checkpoints[-1][0] + 1
-            self.stale = True
+        self._go_back(first_changed)
         return left_out
+
+    def _go_back(self, first_changed: int) -> None:
+        """Leave what is done from a row on to be done again."""
+        if first_changed >= self.done:
+            return
+        # Measurements between two inertial samples were taken with an interpolation between them, which an insertion
+        # may change: all since the sample before is done again.
+        back = first_changed
+        while back > 0 and self.rows.kind[back - 1] != IMU:
+            back -= 1
+        while self.checkpoints[-1][0] >= back:
+            self.checkpoints.pop()
+        self.done = self.checkpoints[-1][0] + 1
+        self.stale = True
 
     def begin(self, engine: Engine, at: int) -> None:
         """Start: the engine's state holds all rows before index ``at``."""
@@ -191,9 +205,7 @@ class History:
         mark depends on the order of the content alone, as all does.
         """
         kinds = self.rows.kind
-        for i in range(start, self.size):
-            if kinds[i] % REPEATED != VISION:
-                continue
+        for i in (start + np.flatnonzero(kinds[start : self.size] % REPEATED == VISION)).tolist():
             sensor = int(self.rows.sensor[i])
             before = i - 1
             while before >= 0 and not (

@@ -148,6 +148,11 @@ class Rows:
         self.ints[start : start + len(other)] = other.ints
         self.floats[start : start + len(other)] = other.floats
 
+    def make_room(self, place: int, size: int) -> None:
+        """Move the rows from ``place`` to ``size`` one further; there must be room behind them."""
+        self.ints[place + 1 : size + 1] = self.ints[place:size].copy()
+        self.floats[place + 1 : size + 1] = self.floats[place:size].copy()
+
     @staticmethod
     def concatenate(a: Rows, b: Rows) -> Rows:
         """Return the rows of a and then those of b."""
