@@ -21,6 +21,7 @@ from estimation.frames import Array
 from estimation.heave.bandpass import BandPass
 from estimation.heave.model import HeaveModel, fit
 from estimation.heave.spectrum import Density
+from estimation.one_thread import one_thread
 from estimation.outcome import Outcome
 from estimation.rows import SEEN_CORRECTED, SEEN_DOUBT, SEEN_LEVEL, SEEN_MOVED, SEEN_PLACE, Rows
 from estimation.watch import LET_GO
@@ -108,7 +109,8 @@ class MotionLearner:
             stop = int(np.searchsorted(waiting.t_ns, self._due_ns, side="right"))
             self._keep(waiting.take(slice(at, stop)))
             at = stop
-            model = self._fit()
+            with one_thread():
+                model = self._fit()
             if model is not None:
                 drift = self.parameters[DRIFT_SPEED]
                 changed = sorted({HEAVE, *self._changed})
