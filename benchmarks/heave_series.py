@@ -54,7 +54,7 @@ class Observation:
 def find_data() -> Path | None:
     """Folder of real records: $DECKFIX_DATA, or the shared data beside the repository."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
-    path = Path(os.environ.get("DECKFIX_DATA", beside)) / "waverider"
+    path = Path(os.environ.get("DECKFIX_DATA") or beside) / "waverider"
     return path if path.is_dir() else None
 
 

@@ -32,7 +32,7 @@ IMPORT_TARGET = 1.0
 
 def default_files() -> list[Path]:
     """Return the flights of the real data, where it is there."""
-    folder = Path(os.environ.get("DECKFIX_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    folder = Path(os.environ.get("DECKFIX_DATA") or Path(__file__).parents[2] / "shared" / "data")
     return sorted((folder / "ardupilot_sitl").glob("*.BIN"))
 
 

@@ -373,7 +373,9 @@ def false_fixes(frames: int, targets: Targets) -> dict[str, Any]:
                 wrong.append(name)
     print(f"\nfalse fixes: {len(wrong)} in {frames} cluttered frames x {len(detectors)} targets {wrong[:5]}")
     targets.add(Target("false fixes in clutter", float(len(wrong)), 0.0))
-    data = Path(os.environ.get("DECKFIX_DATA", Path(__file__).parents[2] / "shared" / "data")) / "sea_photos"
+    data = (
+        Path(os.environ.get("DECKFIX_DATA") or Path(__file__).parents[2] / "shared" / "data") / "sea_photos"
+    )
     photos = sorted(data.glob("*.jpg"))
     on_sea = 0
     for photo in photos:

@@ -49,7 +49,7 @@ class FilterPyEngine:
     """Processes rows in order with filterpy's EKF.
 
     ``p`` is the parameter vector, ``users`` maps a sensor's index to the user's model; what happens is written to
-    ``trail`` where it is on.
+    ``trail`` where it is on; ``steps`` remembers what the deck's chains do over a step.
     """
 
     p: Array

@@ -16,7 +16,7 @@ import pytest  # noqa: E402
 def data_dir() -> Path:
     """Return the folder of real recordings, or skip the test."""
     beside = Path(__file__).parents[2] / "shared" / "data"
-    path = Path(os.environ.get("DECKFIX_DATA", beside))
+    path = Path(os.environ.get("DECKFIX_DATA") or beside)
     if not path.is_dir():
         pytest.skip("real data not found: set DECKFIX_DATA")
     return path

@@ -67,7 +67,7 @@ def test_a_notebook_runs_on_smaller_flights(name: str, tmp_path: Path) -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", SMALLER)
 def test_a_notebook_runs_as_it_is(name: str) -> None:
-    data = os.environ.get("DECKFIX_DATA", FOLDER.parent.parent / "shared" / "data")
+    data = os.environ.get("DECKFIX_DATA") or FOLDER.parent.parent / "shared" / "data"
     assert PROOF[name] in printed(executed(name, {}, Path(data)))
 
 
