@@ -29,7 +29,8 @@ _Angle = Annotated[float, msgspec.Meta(gt=0.0, lt=180.0)]
 class View(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
     """What a camera can see of the target: angles of view across and along the picture, the ranges at which the
     target is recognised, how far outside of the picture (in the target's plane) its centre may lie, since a part of the
-    rings is enough, and times [s] at which it is hidden.
+    rings is enough (at most, and as a share of the distance, since they leave a near picture with the centre), and
+    times [s] at which it is hidden.
     """
 
     horizontal_deg: _Angle = 62.2
@@ -37,6 +38,7 @@ class View(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True
     nearest_m: float = 0.3
     farthest_m: float = 34.0
     outside_m: float = 0.0
+    outside_share: float = 0.25
     hidden_s: tuple[tuple[float, float], ...] = ()
 
     @classmethod
@@ -44,16 +46,17 @@ class View(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True
         """Return how the recommended ring target of this outer diameter [m] is recognised in 640x480 pixels.
 
         From what ``TargetDetector`` recognises in rendered pictures (``benchmarks/fix_model.py``): nearer than a
-        diameter a part of the rings is enough, until they are too large for the picture.
+        diameter a part of the rings is enough. Over the target's middle it sees the small rings down to a tenth of the
+        diameter.
         """
-        return cls(nearest_m=0.15 * diameter_m, farthest_m=34.0 * diameter_m, outside_m=0.1 * diameter_m)
+        return cls(nearest_m=0.1 * diameter_m, farthest_m=34.0 * diameter_m, outside_m=0.15 * diameter_m)
 
     def sees(self, t_s: Array, seen_m: Array) -> NDArray[np.bool_]:
         """Return at which of the times t_s (n,) a target at ``seen_m`` (n, 3), camera axes, is seen."""
         across, along = (math.tan(math.radians(0.5 * a)) for a in (self.horizontal_deg, self.vertical_deg))
         x, y, z = seen_m.T
         distance = np.linalg.norm(seen_m, axis=1)
-        reach = self.outside_m
+        reach = np.minimum(self.outside_m, self.outside_share * z)
         seen: NDArray[np.bool_] = (
             (z > 0.0) & (np.abs(x) < across * z + reach) & (np.abs(y) < along * z + reach)
         )

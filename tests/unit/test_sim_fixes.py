@@ -118,6 +118,16 @@ def test_a_view_has_edges() -> None:
     ]
 
 
+def test_a_part_of_a_near_target_is_enough_until_its_rings_leave_the_picture() -> None:
+    """The target's centre may lie outside of the picture by a quarter of the distance, at most 0.15 diameters."""
+    view = View.of_target(1.0)
+    border = math.tan(math.radians(0.5 * view.horizontal_deg))
+    for distance, reach in ((0.2, 0.05), (0.5, 0.125), (2.0, 0.15)):
+        places = np.array([[border * distance + reach + off, 0.0, distance] for off in (-0.001, 0.001)])
+        assert view.sees(np.zeros(2), places).tolist() == [True, False]
+    assert view.sees(np.zeros(2), np.array([[0.0, 0.0, 0.101], [0.0, 0.0, 0.099]])).tolist() == [True, False]
+
+
 def test_fixes_arrive_late_and_on_the_companions_clock(flight: SimulatedFlight) -> None:
     rows = fixes(flight)
     assert set(rows["clock"]) == {flight.batch.clocks.index("companion")}
