@@ -85,6 +85,7 @@ GUIDES: dict[str, Callable[[LandingConfig], Guidance]] = {
 class Landing:
     end: str
     aborts: int
+    rises: int
     duration_s: float
     speed_mps: float
     miss_m: float
@@ -109,10 +110,15 @@ def judged(flown: Flown) -> Landing:
     aborts = sum(
         mode is Mode.ABORT and reason is not Reason.GIVEN_UP for _, mode, reason in flown.transitions
     )
+    # Descents broken off for the height that a quiet moment is waited for at.
+    rises = sum(
+        mode is Mode.LANDING and reason in (Reason.OUTSIDE_R_LAND, Reason.NO_CONTACT)
+        for _, mode, reason in flown.transitions
+    )
     touch = flown.contact
     if touch is None:
-        return Landing(flown.end, aborts, float(flown.t_s[-1]), float("nan"), float("nan"), False)
-    return Landing(flown.end, aborts, touch.t_s, touch.speed_mps, touch.miss_m, touch.mode is Mode.LANDING)
+        return Landing(flown.end, aborts, rises, float(flown.t_s[-1]), float("nan"), float("nan"), False)
+    return Landing(flown.end, aborts, rises, touch.t_s, touch.speed_mps, touch.miss_m, touch.descending)
 
 
 def summary(flights: list[Landing], radius: float) -> dict[str, float]:
@@ -125,6 +131,7 @@ def summary(flights: list[Landing], radius: float) -> dict[str, float]:
     }
     out["away from the descent"] = float(sum(np.isfinite(f.speed_mps) and not f.in_descent for f in flights))
     out["aborts"] = float(sum(f.aborts for f in flights))
+    out["rises"] = float(sum(f.rises for f in flights))
     if len(speed):
         for name, values in (("speed", speed), ("miss", miss)):
             for label, share in (("median", 50), ("p95", 95)):
@@ -139,9 +146,10 @@ def line(name: str, s: dict[str, float]) -> str:
         return f"  {name:11s} no landing in {s['flights']:.0f}"
     return (
         f"  {name:11s} {s['landings']:4.0f}/{s['flights']:.0f} landed, {s['outside']:.0f} outside r_land, "
-        f"{s['aborts']:.0f} aborts; contact {s['speed_median']:.2f} median {s['speed_p95']:.2f} p95 "
-        f"{s['speed_max']:.2f} max m/s; miss {s['miss_median']:.2f} median {s['miss_p95']:.2f} p95 "
-        f"{s['miss_max']:.2f} max m; {s['time_median']:.0f} s"
+        f"{s['rises']:.0f} descents broken off, {s['aborts']:.0f} aborts; "
+        f"contact {s['speed_median']:.2f} median {s['speed_p95']:.2f} p95 {s['speed_max']:.2f} max m/s; "
+        f"miss {s['miss_median']:.2f} median {s['miss_p95']:.2f} p95 {s['miss_max']:.2f} max m; "
+        f"{s['time_median']:.0f} s"
     )
 
 
@@ -185,8 +193,11 @@ def main() -> None:
                 flown += found[guide]["landings"]
             print(line(guide, found[guide]), dict(Counter(f.end for f in chosen)), flush=True)
         print(f"  {time.perf_counter() - begin:.0f} s", flush=True)
-        # Each contact's speed and miss, so that runs with other seeds can be put together.
-        contacts = {g: [[one[g].speed_mps, one[g].miss_m] for one in flights] for g in arguments.guide}
+        # Each contact's speed and miss, and whether it was in a descent: runs with other seeds can be put together.
+        contacts = {
+            g: [[one[g].speed_mps, one[g].miss_m, one[g].in_descent] for one in flights]
+            for g in arguments.guide
+        }
         document[sea] = {"summary": found, "contacts": contacts}
         if sea != "Beaufort 0" and {"deckfix", "blind"} <= found.keys():
             ratios = {k: found["deckfix"][k] / found["blind"][k] for k in ("speed_median", "speed_p95")}

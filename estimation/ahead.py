@@ -14,8 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from estimation.band import BAND_PARAMETERS, BAND_SIZE, band_matrix, band_stationary
-from estimation.deck import DRIFT_TIME_S, HEAVE, SWAY_EAST, SWAY_NORTH
+from estimation.deck import DRIFT_SPEED, DRIFT_TIME_S, HEAVE, SWAY_EAST, SWAY_NORTH
 from estimation.frames import Array
+from estimation.state import (
+    PD0,
+    PH0,
+    PLATFORM_DRIFT,
+    PLATFORM_HEAVE,
+    PLATFORM_OFFSET,
+    PLATFORM_SWAY,
+    POSITION,
+    PS0,
+    VELOCITY,
+    Offsets,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +38,8 @@ class DeckForecast:
     rate over that of the sea: 1 is certain, 0 knows nothing but the sea. ``sea_rate_sigma_mps`` is the rate's 1-sigma
     in that sea, ``learned`` tells whether the sea was learned in flight (else it is the configuration's prior).
     ``velocity_mps`` (m, 2) is the deck's horizontal velocity, north and east, of the place's drift and of the sway.
+    ``apart_covariance_m2`` (m, 2, 2) is that of the vehicle's place relative to the target, north and east, when
+    nothing more is seen until then: a vehicle that follows what is foreseen will be off by so much.
     """
 
     t_ns: int
@@ -38,15 +52,25 @@ class DeckForecast:
     sea_rate_sigma_mps: float
     learned: bool
     velocity_mps: Array
+    apart_covariance_m2: Array
 
     def rate_at(self, horizon_s: float) -> tuple[float, float]:
         """Return the rate and its 1-sigma [m/s] at a horizon, interpolated, and held beyond the ends."""
         rate = float(np.interp(horizon_s, self.horizon_s, self.rate_mps))
         return rate, float(np.interp(horizon_s, self.horizon_s, self.rate_sigma_mps))
 
+    def rise_m(self, horizon_s: float) -> float:
+        """Return how far [m] the deck will have come up at a horizon since the first of them, interpolated."""
+        return float(np.interp(horizon_s, self.horizon_s, self.height_m) - self.height_m[0])
+
     def velocity_at(self, horizon_s: float) -> Array:
         """Return the deck's horizontal velocity (2,) [m/s] at a horizon, interpolated, and held beyond the ends."""
         return np.array([np.interp(horizon_s, self.horizon_s, axis) for axis in self.velocity_mps.T])
+
+    def apart_at(self, horizon_s: float) -> Array:
+        """Return the covariance (2, 2) [m^2] of the relative place at a horizon, interpolated, held beyond the ends."""
+        flat = self.apart_covariance_m2.reshape(-1, 4)
+        return np.array([np.interp(horizon_s, self.horizon_s, entry) for entry in flat.T]).reshape(2, 2)
 
     def quiet_probability(self, begin_s: float, end_s: float, rate_limit_mps: float) -> float:
         """Return the smallest probability, over the horizons from begin to end, that |rate| is below the limit.
@@ -72,6 +96,8 @@ class DeckForecaster:
     _spread: Array | None = None
     _sea: Array | None = None
     _sway: Array | None = None
+    _ways: Array | None = None
+    _unseen: Array | None = None
 
     @classmethod
     def at(cls, horizon_s: ArrayLike) -> DeckForecaster:
@@ -85,40 +111,58 @@ class DeckForecaster:
         return cls(h)
 
     def forecast(
-        self,
-        t_ns: int,
-        heave: Array,
-        P: Array,
-        motion: Array,
-        learned: bool,
-        sway: Array,
-        drift: Array,
+        self, t_ns: int, x: Array, P: Array, motion: Array, learned: bool, offsets: Offsets
     ) -> DeckForecast:
-        """Return the forecast from the heave states (6,), their covariance (6, 6), the states of the sway (12,), the
-        drift's velocity (2,) and the motion's parameters (22,) at ``t_ns``.
+        """Return the forecast from the nominal state (NOMINAL_SIZE,), its error's covariance (n, n), the motion's
+        parameters (22,) and the offsets of the blocks at ``t_ns``; the platform's blocks must be among them.
         """
         if self._parameters is None or not np.array_equal(motion, self._parameters):
             self._prepare(motion)
             self._parameters = motion.copy()
         assert self._rows is not None and self._spread is not None and self._sea is not None
         assert self._sway is not None
-        mean = self._rows @ heave
-        variance = np.einsum("mki,ij,mkj->mk", self._rows, P, self._rows) + self._spread
+        start = offsets[PLATFORM_HEAVE]
+        block = slice(start, start + BAND_SIZE)
+        mean = self._rows @ x[PH0 : PH0 + BAND_SIZE]
+        variance = np.einsum("mki,ij,mkj->mk", self._rows, P[block, block], self._rows) + self._spread
         # What is known of the sea alone bounds the doubt.
         variance = np.clip(variance, 0.0, self._sea)
         with np.errstate(invalid="ignore", divide="ignore"):
             skill = np.where(self._sea[1] > 0.0, 1.0 - variance[:, 1] / self._sea[1], 0.0)
         sigma = np.sqrt(variance)
-        swing = np.einsum("mak,ak->ma", self._sway, sway.reshape(2, BAND_SIZE))
+        swing = np.einsum("mak,ak->ma", self._sway, x[PS0 : PS0 + 2 * BAND_SIZE].reshape(2, BAND_SIZE))
         remains = np.exp(-self.horizon_s / DRIFT_TIME_S)
+        velocity = swing + remains[:, None] * x[PD0 : PD0 + 2]
         return DeckForecast(
             t_ns, self.horizon_s, mean[:, 0], sigma[:, 0], mean[:, 1], sigma[:, 1], skill,
-            math.sqrt(self._sea[1]), learned, swing + remains[:, None] * drift,
+            math.sqrt(self._sea[1]), learned, velocity, self._apart(P, offsets),
         )  # fmt: skip
 
+    def _apart(self, P: Array, offsets: Offsets) -> Array:
+        """Return the covariance (m, 2, 2) of the relative place at the horizons without a measurement until then.
+
+        Of what is known now, that place is p + h v - o - T (1 - exp(-h / T)) d - e' F s: the vehicle's place and
+        velocity, the deck's mean place, its drift and the states of its sway. The sway adds the part of its spectrum
+        that it has not shown yet, the drift its noise; that of the inertial sensors is far smaller.
+        """
+        assert self._ways is not None and self._unseen is not None
+        places = [
+            place
+            for axis in range(2)
+            for place in (
+                offsets[POSITION] + axis, offsets[VELOCITY] + axis, offsets[PLATFORM_OFFSET] + axis,
+                offsets[PLATFORM_DRIFT] + axis, *(offsets[PLATFORM_SWAY] + axis * BAND_SIZE + np.arange(BAND_SIZE)),
+            )
+        ]  # fmt: skip
+        covariance: Array = self._ways @ P[np.ix_(places, places)] @ self._ways.transpose(0, 2, 1)
+        covariance[:, [0, 1], [0, 1]] += self._unseen
+        return covariance
+
     def _prepare(self, motion: Array) -> None:
-        """Fill rows (m, 2, 6) of height and rate, their own spread (m, 2) and the sea's variances (2,); and the rows
-        (m, 2, 6) of the sway's velocity north and east.
+        """Fill rows (m, 2, 6) of height and rate, their own spread (m, 2) and the sea's variances (2,); the rows
+        (m, 2, 6) of the sway's velocity; and those (m, 2, 20) of the relative place, whose columns are for each axis
+        the vehicle's place and velocity, the deck's mean place, its drift and its sway, with the variance (m, 2) that
+        sway and drift add.
         """
         from scipy.linalg import expm
 
@@ -130,8 +174,22 @@ class DeckForecaster:
         self._rows = np.stack([seen @ expm(f * h) for h in self.horizon_s])
         self._sea = np.einsum("ki,ij,kj->k", seen, S, seen)
         self._spread = self._sea - np.einsum("mki,ij,mkj->mk", self._rows, S, self._rows)
-        chains = [band_matrix(motion[c : c + BAND_PARAMETERS]) for c in (SWAY_NORTH, SWAY_EAST)]
-        self._sway = np.stack([[g[5] @ expm(g * h) for g in chains] for h in self.horizon_s])
+        bands = [motion[c : c + BAND_PARAMETERS] for c in (SWAY_NORTH, SWAY_EAST)]
+        chains = [band_matrix(band) for band in bands]
+        places = np.stack([[expm(g * h)[5] for g in chains] for h in self.horizon_s])
+        self._sway = np.stack([places[:, k] @ g for k, g in enumerate(chains)], axis=1)
+        h, carries = self.horizon_s, DRIFT_TIME_S * (1.0 - np.exp(-self.horizon_s / DRIFT_TIME_S))
+        ways = np.zeros((len(h), 2, 2, 4 + BAND_SIZE))
+        for k in range(2):
+            ways[:, k, k, :4] = np.stack([np.ones_like(h), h, -np.ones_like(h), -carries], axis=1)
+            ways[:, k, k, 4:] = -places[:, k]
+        self._ways = ways.reshape(len(h), 2, -1)
+        sways = np.stack([band_stationary(band) for band in bands])
+        self._unseen = sways[:, 5, 5] - np.einsum("mki,kij,mkj->mk", places, sways, places)
+        # An integrated first-order Gauss-Markov process.
+        time, remains = self.horizon_s / DRIFT_TIME_S, np.exp(-self.horizon_s / DRIFT_TIME_S)
+        drift = (motion[DRIFT_SPEED] * DRIFT_TIME_S) ** 2 * (2.0 * time - 3.0 + 4.0 * remains - remains**2)
+        self._unseen = np.maximum(self._unseen + drift[:, None], 0.0)
 
 
 def _between(low: float, high: float, mean: float, sigma: float) -> float:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from estimation.ahead import DeckForecast, DeckForecaster
 from estimation.alignment import Aligner
-from estimation.band import BAND_PARAMETERS, BAND_SIZE
+from estimation.band import BAND_PARAMETERS
 from estimation.clockbank import ClockBank, ClockSummary
 from estimation.config import Config, ConfigError
 from estimation.deck import HEAVE, prior_motion
@@ -53,7 +53,7 @@ from estimation.rows import (
     Rows,
 )
 from estimation.screening import malformed, malformed_one
-from estimation.state import BG0, PD0, PH0, PLATFORM_HEAVE, PS0, Layout
+from estimation.state import BG0, PLATFORM_HEAVE, Layout
 from estimation.tape import Tape
 
 EngineName = Literal["auto", "filterpy", "compiled"]
@@ -198,15 +198,11 @@ class LandingEstimator:
 
     def deck_forecast(self, forecaster: DeckForecaster) -> DeckForecast | None:
         """Return the deck ahead of the newest estimate, or None before the start and where the platform is off."""
-        start = int(self.layout.offsets[PLATFORM_HEAVE])
-        if self._engine is None or start < 0:
+        if self._engine is None or self.layout.offsets[PLATFORM_HEAVE] < 0:
             return None
         s = self._engine.state
-        block = slice(start, start + BAND_SIZE)
         learned = self._learner is not None and HEAVE in self._learner.blocks
-        x, sway = s.x[PH0 : PH0 + BAND_SIZE], s.x[PS0 : PS0 + 2 * BAND_SIZE]
-        drift = s.x[PD0 : PD0 + 2]
-        return forecaster.forecast(int(s.clock[0]), x, s.P[block, block], s.motion, learned, sway, drift)
+        return forecaster.forecast(int(s.clock[0]), s.x, s.P, s.motion, learned, self.layout.offsets)
 
     def finish(self) -> None:
         """Settle what is still in the window; measurements that no inertial sample followed were in the future."""

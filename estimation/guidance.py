@@ -101,13 +101,30 @@ def probably_inside(e: Estimate, radius: float, ahead_s: float = 0.0) -> float:
     return inside_probability(e.deck[:2] + ahead_s * e.deck[3:5], covariance, radius)
 
 
-def probably_met(e: Estimate, c: LandingConfig) -> float:
-    """Return the probability that the vehicle stands on the deck before it can answer to a set-point: that the relative
-    velocity carries it there within ``response_s``.
+def probably_inside_at_contact(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -> float:
+    """Return the probability of standing inside r_land when the descent goes on to the deck and nothing more is seen.
+
+    The relative velocity carries the vehicle on until it answers; from then on it closes what it knows to be off.
+    What it does not know grows meanwhile (``DeckForecast.apart_at``).
     """
-    P = e.deck_covariance
-    left = -float(e.deck[2]) - c.gear_m - c.response_s * float(e.deck[5])
-    variance = float(P[2, 2] + 2.0 * c.response_s * P[2, 5] + c.response_s**2 * P[5, 5])
+    ahead = time_to_contact(-float(e.deck[2]), c)
+    if forecast is None:
+        return probably_inside(e, c.r_land_m, ahead)
+    carried = min(ahead, c.response_level_s)
+    left = (e.deck[:2] + carried * e.deck[3:5]) * math.exp(-c.follow_gain * (ahead - carried))
+    return inside_probability(left, forecast.apart_at(ahead), c.r_land_m)
+
+
+def probably_met(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -> float:
+    """Return the probability that the vehicle stands on the deck before it can answer to a set-point: that it goes on
+    as it does while the deck moves as it is foreseen, or, without a forecast, goes on as well, for ``response_s``.
+    """
+    P, t = e.deck_covariance, c.response_s
+    closing = t * float(e.deck[5])
+    if forecast is not None:
+        closing = t * float(e.velocity_mps[2]) + forecast.rise_m(t)
+    left = -float(e.deck[2]) - c.gear_m - closing
+    variance = float(P[2, 2] + 2.0 * t * P[2, 5] + t**2 * P[5, 5])
     if variance <= 0.0:
         return float(left < 0.0)
     return 0.5 * math.erfc(left / math.sqrt(2.0 * variance))
@@ -172,8 +189,9 @@ def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
     height = -float(e.deck[2])
     if p.descent_ns is None:
         aim = np.array([0.0, 0.0, -c.hold_height_m])
-        wanted = c.position_gain * (height - c.hold_height_m)
-        descent = min(c.approach_rate_mps, max(-c.climb_mps, wanted))
+        # From the deck up at the rate of an abort.
+        gain = c.position_gain if height > c.hold_height_m else c.climb_mps / (c.hold_height_m - c.gear_m)
+        descent = min(c.approach_rate_mps, max(-c.climb_mps, gain * (height - c.hold_height_m)))
     else:
         aim = np.array([0.0, 0.0, -c.gear_m])
         descent = descent_rate(height, c)

@@ -4,7 +4,7 @@
     TRACKING     over the target, down to the tracking altitude, inside r_track (3.5); heave is ignored
     OBSERVATION  there, until the deck's motion is foreseen with skill, is calm, or time is up (3.6)
     LANDING      down to a height over the deck, wait there for a quiet moment, then down to contact (3.7); back to
-                 that height where the place is not good enough while the target is still in view, an abort below that
+                 that height where the place is not good enough, or contact does not come
     ABORT        up and away from the deck; then the search begins anew, or the landing is given up
 
 Nothing is commanded here: a ``Decision`` holds the velocity that the vehicle should fly (``estimation.guidance``), and
@@ -24,6 +24,7 @@ from estimation.guidance import (
     decide,
     heading_rad,
     probably_inside,
+    probably_inside_at_contact,
     probably_met,
     probably_quiet,
     search_altitude_m,
@@ -46,6 +47,8 @@ ALIGNED_S = 1.0
 ALTITUDE_SHARE = 0.1
 """Tracking altitude counts as reached within this share of it, and half a metre."""
 HOLD_TOLERANCE_M = 0.2
+OVERDUE_S = 0.3
+"""Contact is overdue where it has been probable for so long."""
 LONGEST_DESCENT = 4.0
 """A last descent that takes longer than this multiple of what it should take is broken off."""
 STATION_M = 3.0
@@ -147,22 +150,31 @@ def _observation(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) ->
 
 def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Progress:
     height = -float(e.deck[2])
-    if seen.detection_age_s > c.lost_s and height > c.blind_height_m:
+    lost = seen.detection_age_s > c.lost_s and height > c.blind_height_m
+    if lost and (p.rose_ns is None or (seen.now_ns - p.rose_ns) * 1e-9 > c.lost_s):
         return _abort(p, Reason.TARGET_LOST, seen)
     if tilt_rad(e) > c.abort_tilt_rad:
         return _abort(p, Reason.TILTED, seen)
     fall_s = time_to_contact(c.hold_height_m, c)
     if p.descent_ns is not None:
-        # Judged is the place at contact, as far ahead as an answer takes. A vehicle that stands before it has answered
-        # more probably than not, or more probably than it stands outside, is not led up again for its place.
-        inside = probably_inside(e, c.r_land_m, min(time_to_contact(height, c), c.response_s))
-        met = probably_met(e, c)
-        if inside < min(c.abort_probability, 1.0 - met) and met < 0.5:
-            if height <= c.blind_height_m:
-                return _abort(p, Reason.OUTSIDE_R_LAND, seen)
-            return replace(p, descent_ns=None, met_ns=None, reason=Reason.OUTSIDE_R_LAND)
+        met = probably_met(e, seen.forecast, c)
+        # Judged is the place at contact: as far ahead as an answer takes while the target is in view, all the way
+        # where it is not. A vehicle that stands before it has answered more probably than not, or more probably
+        # than it stands outside, is not led up again for its place.
+        blind = seen.detection_age_s >= FRESH_S and height <= c.blind_height_m
+        if blind:
+            inside, asked = probably_inside_at_contact(e, seen.forecast, c), c.land_probability
+        else:
+            ahead = min(time_to_contact(height, c), c.response_s)
+            inside, asked = probably_inside(e, c.r_land_m, ahead), c.abort_probability
+        if inside < min(asked, 1.0 - met) and met < 0.5:
+            return _rise(p, Reason.OUTSIDE_R_LAND, seen)
         if (seen.now_ns - p.descent_ns) * 1e-9 > LONGEST_DESCENT * fall_s:
             return _abort(p, Reason.NO_CONTACT, seen)
+        # Without sight of it, a deck that should have been met by now is not where the estimate has it.
+        p = _holding(p, blind and met > 0.5, seen)
+        if _held_s(p, seen) > OVERDUE_S:
+            return _rise(p, Reason.NO_CONTACT, seen)
         return p
     low = height < c.hold_height_m + HOLD_TOLERANCE_M
     p = _holding(p, low, seen)
@@ -171,9 +183,9 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
     if low and probably_inside(e, c.r_land_m, ahead) >= c.land_probability and tilt_rad(e) < c.track_tilt_rad:
         asked = c.quiet_probability * max(0.0, 1.0 - waited / c.wait_s)
         if waited >= c.wait_s:
-            return replace(p, descent_ns=seen.now_ns, reason=Reason.WAITED_LONG_ENOUGH)
+            return replace(p, descent_ns=seen.now_ns, met_ns=None, reason=Reason.WAITED_LONG_ENOUGH)
         if probably_quiet(e, seen.forecast, c) >= asked:
-            return replace(p, descent_ns=seen.now_ns, reason=Reason.DECK_QUIET)
+            return replace(p, descent_ns=seen.now_ns, met_ns=None, reason=Reason.DECK_QUIET)
     if waited > 2.0 * c.wait_s or _mode_s(p, seen) > 60.0 + 2.0 * c.wait_s:
         return _abort(p, Reason.NEVER_INSIDE_R_LAND, seen)
     return p
@@ -192,9 +204,14 @@ def _aborting(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pr
 
 def _enter(p: Progress, mode: Mode, reason: Reason, seen: Situation) -> Progress:
     return replace(
-        p, mode=mode, reason=reason, since_ns=seen.now_ns, met_ns=None, descent_ns=None, station_ns=None,
-        rate_power_m2ps2=0.0, rate_count=0,
+        p, mode=mode, reason=reason, since_ns=seen.now_ns, met_ns=None, descent_ns=None, rose_ns=None,
+        station_ns=None, rate_power_m2ps2=0.0, rate_count=0,
     )  # fmt: skip
+
+
+def _rise(p: Progress, reason: Reason, seen: Situation) -> Progress:
+    """Break a descent off for the height that a quiet moment is waited for at."""
+    return replace(p, descent_ns=None, met_ns=None, rose_ns=seen.now_ns, reason=reason)
 
 
 def _abort(p: Progress, reason: Reason, seen: Situation) -> Progress:

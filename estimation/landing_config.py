@@ -55,11 +55,15 @@ class LandingConfig(Table, frozen=True):
         float, share("being inside r_track must be this probable before the deck is observed")
     ] = 0.95
     land_probability: Annotated[
-        float, share("being inside r_land must be this probable before the vehicle goes down")
+        float,
+        share(
+            "being inside r_land must be this probable before the vehicle goes down, and at contact while it goes down "
+            "low without sight of the target"
+        ),
     ] = 0.99
     abort_probability: Annotated[
         float,
-        share("below this probability of being inside r_land the descent is broken off"),
+        share("in sight of it, the descent is broken off below this probability of being inside r_land"),
     ] = 0.95
     track_tilt_rad: Annotated[
         float,
@@ -137,7 +141,7 @@ class LandingConfig(Table, frozen=True):
     ] = 0.3
     response_level_s: Annotated[
         float, not_negative("the same of the horizontal velocity, for the deck's sway", "s")
-    ] = 0.5
+    ] = 0.35
     lost_s: Annotated[float, positive("the target is lost after this time without a fused fix", "s")] = 1.0
     stale_s: Annotated[float, positive("an estimate older than this is not flown on", "s")] = 0.3
     sigma_limit_m: Annotated[

@@ -68,7 +68,7 @@ EXPLANATIONS: dict[Reason, str] = {
     Reason.CONTACT: "the vehicle stands on the deck",
     Reason.OUTSIDE_R_LAND: "not probable enough any more to touch down inside r_land",
     Reason.TILTED: "the vehicle is tilted too far",
-    Reason.NO_CONTACT: "the descent took much longer than it should",
+    Reason.NO_CONTACT: "contact did not come when it should have",
     Reason.NEVER_INSIDE_R_LAND: "being inside r_land did not get probable enough",
     Reason.ESTIMATE_STALE: "the estimate is too old to be flown on",
     Reason.ESTIMATE_UNSURE: "the estimate is too uncertain, or not finite",
@@ -97,7 +97,8 @@ class Progress:
     """What the state machine remembers: everything that the next step depends on beside its arguments.
 
     ``since_ns`` is the begin of the mode, ``met_ns`` since when the condition for going on has held, ``descent_ns``
-    the begin of the last descent (None: not yet), ``station_ns`` the arrival over the anchor, ``attempts`` the aborts.
+    the begin of the last descent (None: not yet), ``rose_ns`` when one was last broken off for the holding height,
+    ``station_ns`` the arrival over the anchor, ``attempts`` the aborts.
     ``rate_power_m2ps2`` is the mean square of the deck's rate over the ``rate_count`` steps of the observation.
     ``losses`` counts how often the target was lost again before a landing.
     ``drift_mps`` north and east is added against an error that lasts, ``stepped_ns`` when that was last
@@ -109,6 +110,7 @@ class Progress:
     since_ns: int = 0
     met_ns: int | None = None
     descent_ns: int | None = None
+    rose_ns: int | None = None
     station_ns: int | None = None
     attempts: int = 0
     yaw_rad: float = 0.0

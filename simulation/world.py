@@ -74,12 +74,14 @@ class Filter:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """The first touch of the deck: time, speed into the deck along its normal, place from its centre (2,), mode."""
+    """The first touch of the deck: time, speed into the deck along its normal, place from its centre (2,), and whether
+    the vehicle was on its way down to it, rather than somewhere else or on its way up.
+    """
 
     t_s: float
     speed_mps: float
     offset_m: Array
-    mode: Mode
+    descending: bool
 
     @property
     def miss_m(self) -> float:
@@ -262,8 +264,9 @@ class World:
         self._kept.append((self.t_s, self._truth[0].copy(), self._deck[0].copy()))
         if self._contact is None and self._touch[0] >= 0.0:
             at = self.t_s + self._touch[0] / body.STEP_HZ
-            mode = self._progress.mode
-            self._contact = Contact(at, float(self._touch[1]), self._touch[2:4].copy(), mode)
+            p = self._progress
+            descending = p.mode is Mode.LANDING and p.descent_ns is not None
+            self._contact = Contact(at, float(self._touch[1]), self._touch[2:4].copy(), descending)
         self.instruments.sense(self._moment, self.t_s + TICK_S)
         self._ticks += 1
         self.t_s = self._ticks * TICK_S

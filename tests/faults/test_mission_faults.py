@@ -59,7 +59,7 @@ def on_the_deck_or_not_at_all(flown: Flown) -> None:
     end_s = flown.t_s[-1] if flown.contact is None else flown.contact.t_s
     assert end_s <= flown.mission.longest_s
     if flown.contact is not None:
-        assert flown.contact.mode is Mode.LANDING
+        assert flown.contact.descending
         assert flown.contact.miss_m < flown.mission.config.landing.r_land_m
     assert (flown.end == "landed") <= (flown.contact is not None)
 

@@ -11,8 +11,15 @@ from hypothesis import strategies as st
 
 from estimation.ahead import DeckForecast
 from estimation.frames import euler_to_quat
-from estimation.guidance import deck_rate_ahead, inside_probability, search_altitude_m, time_to_contact
-from estimation.landing import step
+from estimation.guidance import (
+    deck_rate_ahead,
+    inside_probability,
+    probably_inside_at_contact,
+    probably_met,
+    search_altitude_m,
+    time_to_contact,
+)
+from estimation.landing import FRESH_S, step
 from estimation.landing_config import LandingConfig
 from estimation.modes import EXPLANATIONS, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
@@ -41,10 +48,12 @@ def situations(draw: st.DrawFn, now_ns: int = 0) -> Situation:
         now_ns - age, position, deck[3:6].copy(), q, nine, nominal, np.ones(36), deck, covariance
     )
     rate, sigma = draw(st.floats(-0.8, 0.8)), draw(st.floats(0.01, 0.5))
+    growth = draw(st.floats(0.0, 0.5))
     forecast = DeckForecast(
         now_ns, HORIZON, 0.0 * HORIZON, 0.1 + 0.0 * HORIZON, rate * np.cos(HORIZON), sigma + 0.0 * HORIZON,
         0.0 * HORIZON + draw(st.floats(0.0, 1.0)), 0.5, draw(st.booleans()),
         np.zeros((len(HORIZON), 2)),
+        covariance[:2, :2] + (growth * HORIZON)[:, None, None] ** 2 * np.eye(2),
     )  # fmt: skip
     return Situation(
         now_ns,
@@ -97,16 +106,22 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
             height, rate = -e.deck[2], deck_rate_ahead(e, seen.forecast, C.response_s)
             assert decision.velocity_mps[2] + rate <= C.approach_rate_mps + 1e-12
             if before.mode is Mode.LANDING:
-                assert seen.detection_age_s <= C.lost_s or height <= C.blind_height_m
+                risen = before.rose_ns is not None and seen.now_ns - before.rose_ns <= C.lost_s * 1e9
+                assert seen.detection_age_s <= C.lost_s or height <= C.blind_height_m or risen
             if after.descent_ns is not None:
                 P, fresh = e.deck_covariance, before.descent_ns is None
-                # In the descent it is the place at contact that counts, as far ahead as the vehicle takes to answer.
+                # In the descent it is the place at contact that counts: in sight as far ahead as the vehicle takes to
+                # answer, without it low over the deck all the way down.
+                blind = seen.detection_age_s >= FRESH_S and height <= C.blind_height_m
                 ahead = 0.0 if fresh else min(time_to_contact(height, C), C.response_s)
                 T = np.hstack([np.eye(2), np.zeros((2, 1)), ahead * np.eye(2), np.zeros((2, 3))])
                 inside = inside_probability(T @ e.deck, T @ P @ T.T, C.r_land_m)
+                if blind and not fresh:
+                    inside = probably_inside_at_contact(e, seen.forecast, C)
+                asked = C.land_probability if fresh or blind else C.abort_probability
                 # Nearer than it could answer it is not led up again.
-                committed = height - C.gear_m < C.touchdown_rate_mps * C.response_s and not fresh
-                assert committed or inside >= (C.land_probability if fresh else C.abort_probability) - 1e-9
+                met = 0.0 if fresh else probably_met(e, seen.forecast, C)
+                assert met >= 0.5 or inside >= min(asked, 1.0 - met) - 1e-9
         if after.mode is not before.mode:
             assert after.since_ns == seen.now_ns
         before = after

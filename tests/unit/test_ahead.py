@@ -10,10 +10,19 @@ import pytest
 from estimation.ahead import DeckForecaster
 from estimation.band import band_matrix, band_stationary
 from estimation.config import parse_config
-from estimation.deck import deck_transition, no_steps
+from estimation.deck import deck_output, deck_transition, no_steps
 from estimation.estimator import LandingEstimator
-from estimation.parameters import Site, pack_parameters
-from estimation.state import PD0, PH0, PS0, Layout, nominal_zero
+from estimation.parameters import OFFSET_WALK, Site, pack_parameters
+from estimation.state import (
+    PD0,
+    PH0,
+    PLATFORM_HEAVE,
+    POSITION,
+    PS0,
+    VELOCITY,
+    Layout,
+    nominal_zero,
+)
 from simulation.flight import load_scenario, simulate
 
 HEAVE = np.array([0.5, 1.0, 1.3, 1.7, 0.3, 0.2, 0.4])
@@ -26,45 +35,60 @@ CONFIG = parse_config("[platform]\nuse = true\n")
 MOTION = np.array([*HEAVE, *NORTH, *EAST, 0.05])
 
 
-def some_heave() -> tuple[np.ndarray, np.ndarray]:
+LAYOUT = Layout.of(CONFIG)
+HEAVE_BLOCK = slice(LAYOUT.offsets[PLATFORM_HEAVE], LAYOUT.offsets[PLATFORM_HEAVE] + 6)
+
+
+def some_state() -> tuple[np.ndarray, np.ndarray]:
+    """Return a nominal state with a moving deck and a covariance in which everything is correlated."""
     rng = np.random.default_rng(3)
-    root = rng.normal(size=(6, 6)) * 0.02
-    return rng.normal(size=6) * 0.3, root @ root.T + 1e-4 * np.eye(6)
+    root = rng.normal(size=(LAYOUT.size, LAYOUT.size)) * 0.01
+    x = nominal_zero()
+    x[PH0 : PH0 + 6] = rng.normal(size=6) * 0.3
+    x[PS0 : PS0 + 12] = SWAY
+    x[PD0 : PD0 + 2] = DRIFT
+    return x, root @ root.T + 1e-4 * np.eye(LAYOUT.size)
 
 
 def test_the_forecast_is_what_the_filter_would_propagate_to() -> None:
-    layout = Layout.of(CONFIG)
     p = pack_parameters(CONFIG, Site((0.9, 0.1, 0.0), 0.0))
-    start = layout.names.index("platform_heave.1")
-    block = slice(start, start + 6)
-    x6, P = some_heave()
-    x, covariance = nominal_zero(), P.copy()
-    x[PH0 : PH0 + 6] = x6
-    x[PS0 : PS0 + 12] = SWAY
-    x[PD0 : PD0 + 2] = DRIFT
-    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x6, P, MOTION, True, SWAY, DRIFT)
+    # The walk of the mean place, a centimetre in a second, is left out of the forecast.
+    p[OFFSET_WALK] = 0.0
+    x0, P = some_state()
+    x, covariance = x0.copy(), P.copy()
+    forecast = DeckForecaster.at([0.0, 0.8]).forecast(0, x0, P, MOTION, True, LAYOUT.offsets)
+    n = LAYOUT.size
+    position, velocity = LAYOUT.offsets[POSITION], LAYOUT.offsets[VELOCITY]
     for _ in range(160):
-        F, Q = np.eye(layout.size), np.zeros((layout.size, layout.size))
+        F, Q = np.eye(n), np.zeros((n, n))
+        F[position : position + 3, velocity : velocity + 3] = 0.005 * np.eye(3)
         y = x.copy()
-        deck_transition(x, y, 0.005, p, MOTION, *no_steps(), layout.offsets, F, Q)
+        deck_transition(x, y, 0.005, p, MOTION, *no_steps(), LAYOUT.offsets, F, Q)
         x = y
-        covariance = F[block, block] @ covariance @ F[block, block].T + Q[block, block]
+        covariance = F @ covariance @ F.T + Q
     rate = band_matrix(HEAVE)[5]
-    assert forecast.height_m == pytest.approx([x6[5], x[PH0 + 5]], abs=1e-6)
-    assert forecast.rate_mps == pytest.approx([rate @ x6, rate @ x[PH0 : PH0 + 6]], abs=1e-6)
-    assert forecast.rate_sigma_mps[1] == pytest.approx(math.sqrt(rate @ covariance @ rate), rel=1e-3)
+    heave, block = x0[PH0 : PH0 + 6], covariance[HEAVE_BLOCK, HEAVE_BLOCK]
+    assert forecast.height_m == pytest.approx([heave[5], x[PH0 + 5]], abs=1e-6)
+    assert forecast.rate_mps == pytest.approx([rate @ heave, rate @ x[PH0 : PH0 + 6]], abs=1e-6)
+    assert forecast.rate_sigma_mps[1] == pytest.approx(math.sqrt(rate @ block @ rate), rel=1e-3)
+    assert forecast.height_sigma_m[1] == pytest.approx(math.sqrt(block[5, 5]), rel=1e-3)
     for axis, band in enumerate((NORTH, EAST)):
         swing, at = band_matrix(band)[5], PS0 + 6 * axis
         assert forecast.velocity_mps[:, axis] == pytest.approx(
             [swing @ SWAY[6 * axis : 6 * axis + 6] + DRIFT[axis], swing @ x[at : at + 6] + x[PD0 + axis]],
             abs=1e-6,
         )
-    assert forecast.height_sigma_m[1] == pytest.approx(math.sqrt(covariance[5, 5]), rel=1e-3)
+    for at, P_then in ((0, P), (1, covariance)):
+        place = deck_output(x, MOTION, LAYOUT.offsets, n)[1][:2]
+        np.testing.assert_allclose(forecast.apart_covariance_m2[at], place @ P_then @ place.T, rtol=1e-3)
+    assert np.all(np.diag(forecast.apart_covariance_m2[1]) > np.diag(forecast.apart_covariance_m2[0]))
+    np.testing.assert_allclose(forecast.apart_at(0.8), forecast.apart_covariance_m2[1])
+    np.testing.assert_allclose(forecast.apart_at(0.4), forecast.apart_covariance_m2.mean(axis=0))
 
 
 def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
-    x6, P = some_heave()
-    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x6, 1e3 * P, MOTION, False, SWAY, DRIFT)
+    x, P = some_state()
+    forecast = DeckForecaster.at([0.1, 1.0, 200.0]).forecast(0, x, 1e3 * P, MOTION, False, LAYOUT.offsets)
     sea = band_stationary(HEAVE)
     rate = band_matrix(HEAVE)[5]
     assert forecast.sea_rate_sigma_mps == pytest.approx(math.sqrt(rate @ sea @ rate))
@@ -75,8 +99,8 @@ def test_far_ahead_only_the_sea_is_known_and_it_is_never_worse() -> None:
 
 
 def test_the_probability_of_quiet_is_that_of_the_worst_moment() -> None:
-    x6, P = some_heave()
-    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x6, P, MOTION, True, SWAY, DRIFT)
+    x, P = some_state()
+    forecast = DeckForecaster.at(np.arange(0.0, 3.0, 0.1)).forecast(0, x, P, MOTION, True, LAYOUT.offsets)
     chance = forecast.quiet_probability(0.5, 1.5, 0.3)
     rng = np.random.default_rng(1)
     inside = (forecast.horizon_s >= 0.5) & (forecast.horizon_s <= 1.5)

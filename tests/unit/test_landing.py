@@ -14,11 +14,13 @@ from estimation.frames import euler_to_quat
 from estimation.guidance import (
     FOLLOW_MPS2,
     descent_rate,
+    inside_probability,
+    probably_inside_at_contact,
     probably_met,
     search_altitude_m,
     time_to_contact,
 )
-from estimation.landing import step
+from estimation.landing import OVERDUE_S, step
 from estimation.landing_config import LandingConfig
 from estimation.modes import EXPLANATIONS, Decision, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
@@ -39,8 +41,10 @@ def estimate(
     )  # fmt: skip
 
 
-def forecast(t_ns: int, rate: float, skill: float = 0.8) -> DeckForecast:
+def forecast(t_ns: int, rate: float, skill: float = 0.8, growth_mps: float = 0.0) -> DeckForecast:
+    """A forecast whose relative place, if nothing more is seen, becomes unknown at this rate (1-sigma)."""
     ones = np.ones(len(HORIZON))
+    apart = (1e-4 + (growth_mps * HORIZON) ** 2)[:, None, None] * np.eye(2)
     return DeckForecast(
         t_ns,
         HORIZON,
@@ -52,6 +56,7 @@ def forecast(t_ns: int, rate: float, skill: float = 0.8) -> DeckForecast:
         0.4,
         True,
         np.zeros((len(HORIZON), 2)),
+        apart,
     )
 
 
@@ -118,7 +123,6 @@ def landing(descending: bool = True) -> Progress:
     ("seen", "reason"),
     [
         (Situation(10**9, estimate(10**9, (0.0, 0.0, -0.7)), 1.5), Reason.TARGET_LOST),
-        (Situation(10**9, estimate(10**9, (0.6, 0.0, -0.3)), 0.1), Reason.OUTSIDE_R_LAND),
         (Situation(10**9, estimate(10**9, (0.0, 0.0, -0.3), roll=0.4), 0.1), Reason.TILTED),
         (Situation(60 * 10**9, estimate(60 * 10**9, (0.0, 0.0, -0.3)), 0.1), Reason.NO_CONTACT),
         (Situation(10**9, estimate(5 * 10**8, (0.0, 0.0, -0.3)), 0.1), Reason.ESTIMATE_STALE),
@@ -132,12 +136,22 @@ def test_a_descent_is_broken_off_when_it_must_be(seen: Situation, reason: Reason
     assert p.attempts == 1
 
 
-def test_above_the_blind_height_the_place_is_corrected_and_the_quiet_moment_waited_for_anew() -> None:
-    seen = Situation(10**9, estimate(10**9, (0.6, 0.0, -0.8)), 0.1)
+@pytest.mark.parametrize("height_m", [0.8, 0.3])
+def test_a_place_that_is_off_is_corrected_and_the_quiet_moment_waited_for_anew(height_m: float) -> None:
+    seen = Situation(10**9, estimate(10**9, (0.6, 0.0, -height_m)), 0.1)
     p, said = step(landing(), seen, LandingConfig())
     assert (said.mode, said.reason) == (Mode.LANDING, Reason.OUTSIDE_R_LAND)
     assert p.descent_ns is None
+    assert p.rose_ns == seen.now_ns
+    assert p.attempts == 0
     assert said.velocity_mps[2] < 0.0
+
+
+def test_from_the_deck_the_vehicle_rises_as_fast_as_it_would_in_an_abort() -> None:
+    c = LandingConfig()
+    for height, climb in ((c.gear_m, c.climb_mps), (c.hold_height_m, 0.0)):
+        seen = Situation(10**9, estimate(10**9, (0.0, 0.0, -height), 0.3), 0.6, forecast(10**9, 0.3))
+        assert step(landing(False), seen, c)[1].velocity_mps[2] == pytest.approx(-climb - 0.3)
 
 
 @pytest.mark.parametrize(("closing_mps", "stays"), [(0.25, True), (0.0, False)])
@@ -145,19 +159,61 @@ def test_what_stands_before_it_could_be_led_up_stays(closing_mps: float, stays: 
     """The last two centimetres take less than the answer at the touchdown's rate; from rest it can climb."""
     near = estimate(10**9, (0.6, 0.0, -0.12))
     near.deck[5] = closing_mps
-    p, said = step(landing(), Situation(10**9, near, 0.1), LandingConfig())
-    assert (said.mode is Mode.LANDING, p.descent_ns is not None) == (stays, stays)
+    p, _ = step(landing(), Situation(10**9, near, 0.1), LandingConfig())
+    assert (p.descent_ns is not None) == stays
 
 
-@pytest.mark.parametrize(("sigma_m", "mode"), [(0.15, Mode.LANDING), (0.02, Mode.ABORT)])
+@pytest.mark.parametrize(("sigma_m", "stays"), [(0.15, True), (0.02, False)])
 def test_a_deck_that_may_come_up_first_is_not_broken_off_from_for_a_lesser_doubt(
-    sigma_m: float, mode: Mode
+    sigma_m: float, stays: bool
 ) -> None:
     """Some 8 in 100 to stand outside, from 0.25 m over the deck: more probably met than that, or surely not."""
     blind = estimate(10**9, (0.2, 0.0, -0.25))
     blind.deck_covariance[0, 0] = blind.deck_covariance[1, 1] = 0.19**2
     blind.deck_covariance[2, 2] = sigma_m**2
-    assert step(landing(), Situation(10**9, blind, 0.6), LandingConfig())[1].mode is mode
+    p, _ = step(landing(), Situation(10**9, blind, 0.6), LandingConfig())
+    assert (p.descent_ns is not None) == stays
+
+
+@pytest.mark.parametrize(
+    ("age_s", "growth_mps", "stays"), [(0.1, 0.25, True), (0.6, 0.25, False), (0.6, 0.1, True)]
+)
+def test_without_sight_the_whole_way_to_the_deck_is_judged(
+    age_s: float, growth_mps: float, stays: bool
+) -> None:
+    """0.8 s at the touchdown's rate: 0.2 m of doubt at contact are too many, 0.08 m are not."""
+    c = LandingConfig()
+    e = estimate(10**9, (0.15, 0.0, -0.3))
+    told = forecast(10**9, 0.0, growth_mps=growth_mps)
+    p, _ = step(landing(), Situation(10**9, e, age_s, told), c)
+    assert (p.descent_ns is not None) == stays
+    ahead = time_to_contact(0.3, c)
+    left = 0.15 * math.exp(-c.follow_gain * (ahead - c.response_level_s))
+    expected = inside_probability(np.array([left, 0.0]), told.apart_at(ahead), c.r_land_m)
+    assert probably_inside_at_contact(e, told, c) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("age_s", "stays"), [(0.1, True), (0.6, False)])
+def test_a_deck_that_should_have_been_met_by_now_is_risen_from_to_be_seen_again(
+    age_s: float, stays: bool
+) -> None:
+    c = LandingConfig()
+    met = Situation(10**9, estimate(10**9, (0.0, 0.0, -0.08)), age_s)
+    p, _ = fly(landing(), OVERDUE_S, met, c)
+    assert p.descent_ns is not None
+    p, said = fly(p, 0.1, replace(met, now_ns=10**9 + round(OVERDUE_S * 1e9)), c)
+    assert (p.descent_ns is not None) == stays
+    assert said.reason is (Reason.DECK_QUIET if stays else Reason.NO_CONTACT)
+
+
+def test_after_a_rise_the_target_is_given_time_to_come_into_view() -> None:
+    c = LandingConfig()
+    e = estimate(2 * 10**9, (0.0, 0.0, -0.9))
+    risen = replace(landing(False), rose_ns=round(1.5e9))
+    assert step(risen, Situation(2 * 10**9, e, 1.8), c)[1].mode is Mode.LANDING
+    late = 10**9 + risen.rose_ns + 10**8
+    said = step(risen, Situation(late, replace(e, t_ns=late), 2.4), c)[1]
+    assert (said.mode, said.reason) == (Mode.ABORT, Reason.TARGET_LOST)
 
 
 def test_the_probability_of_being_met_is_that_of_draws() -> None:
@@ -170,7 +226,11 @@ def test_the_probability_of_being_met_is_that_of_draws() -> None:
         e.deck[[2, 5]], e.deck_covariance[np.ix_([2, 5], [2, 5])], 200_000
     )
     stands = draws[:, 0] + c.response_s * draws[:, 1] > -c.gear_m
-    assert probably_met(e, c) == pytest.approx(stands.mean(), abs=0.004)
+    assert probably_met(e, None, c) == pytest.approx(stands.mean(), abs=0.004)
+    # A deck that comes to rest does not meet it, one that comes up faster does.
+    for rise, less in ((0.0, True), (0.3, False)):
+        told = replace(forecast(0, 0.0), height_m=rise * HORIZON / c.response_s)
+        assert (probably_met(replace(e, velocity_mps=np.zeros(3)), told, c) < stands.mean()) == less
 
 
 def test_over_the_deck_what_is_off_is_closed_and_no_faster_than_it_can_come_to_rest() -> None:
