@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from estimation.clockbank import ARRIVAL, ClockBank, ClockSummary
 from estimation.config import Config
-from estimation.estimator import EngineName, LandingEstimator, latencies_s
+from estimation.estimator import EngineName, LandingEstimator
 from estimation.events import AUTOPILOT, EventBatch, Kind, TimeSync, unpack
+from estimation.intake import latencies_s
 from estimation.output import Facts, Run
 from estimation.parameters import chi_square_bound
 from estimation.update import MAX_LATENCY_S

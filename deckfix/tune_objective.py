@@ -34,9 +34,10 @@ from deckfix.sync import on_inertial_clock
 from deckfix.tune_parameters import with_values
 from estimation.config import Config, parse_config
 from estimation.consistency import normalised_squared
-from estimation.estimator import EngineName, LandingEstimator, latencies_s
+from estimation.estimator import EngineName, LandingEstimator
 from estimation.events import EventBatch, Kind
 from estimation.frames import Array, quat_conjugate, quat_log, quat_multiply
+from estimation.intake import latencies_s
 from estimation.outcome import Outcome
 from estimation.output import Facts, Run, with_facts
 from estimation.parameters import chi_square_bound

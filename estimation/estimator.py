@@ -15,25 +15,15 @@ from numpy.typing import NDArray
 from estimation.ahead import DeckForecast, DeckForecaster
 from estimation.alignment import Aligner
 from estimation.band import BAND_PARAMETERS
-from estimation.clockbank import ClockBank, ClockSummary
+from estimation.clockbank import ClockSummary
 from estimation.config import Config, ConfigError
 from estimation.deck import HEAVE, prior_motion
-from estimation.events import (
-    AUTOPILOT,
-    COMPANION,
-    EVENT_DTYPE,
-    Event,
-    EventBatch,
-    Kind,
-    Names,
-    TimeSync,
-    pack,
-    unpack,
-)
+from estimation.events import Event, EventBatch, Kind
 from estimation.filter import Model
 from estimation.frames import Array
 from estimation.heave.model import HeaveModel
 from estimation.history import Engine, History
+from estimation.intake import Intake, latencies_s
 from estimation.learning import MotionLearner
 from estimation.ledger import Ledger
 from estimation.outcome import Outcome
@@ -42,17 +32,16 @@ from estimation.parameters import Site, pack_parameters
 from estimation.rows import (
     AGE_NS,
     HEAVE_MODEL,
+    KIND,
     LATE,
-    OWN,
+    OUTCOME,
     PENDING,
-    RESULT,
-    VALUE,
+    T_NS,
     Estimates,
     FilterState,
     Int,
     Rows,
 )
-from estimation.screening import malformed, malformed_one
 from estimation.state import BG0, PLATFORM_HEAVE, Layout
 from estimation.tape import Tape
 
@@ -86,16 +75,13 @@ class LandingEstimator:
     smooth: bool = False
     layout: Layout = field(init=False)
     engine_name: str = field(init=False)
-    _names: Names = field(default_factory=Names)
     _history: History = field(init=False)
     _engine: Engine | None = None
     _aligner: Aligner = field(init=False)
-    _clocks: ClockBank = field(init=False)
+    _intake: Intake = field(init=False)
     _site: Site | None = None
     _consumed: int = 0
-    _next_id: int = 0
-    _models: dict[str, tuple[Model, float]] = field(default_factory=dict)
-    _latency: Array = field(init=False)
+    _models: dict[str, Model] = field(default_factory=dict)
     _period_ns: int = field(init=False)
     _past: list[tuple[int, int]] = field(default_factory=list)
     _estimates: list[Estimates] = field(default_factory=list)
@@ -110,9 +96,8 @@ class LandingEstimator:
         self.layout = Layout.of(c)
         self.engine_name = _choose(self.engine)
         self._history = History(int(c.filter.window_s * 1e9), tape=Tape() if self.smooth else None)
-        self._clocks = ClockBank(AUTOPILOT)
         self._period_ns = round(1e9 / c.filter.output_rate_hz) if c.filter.output_rate_hz else 0
-        self._latency = np.round(latencies_s(c, self.facts) * 1e9)
+        self._intake = Intake(np.round(latencies_s(c, self.facts) * 1e9))
         if c.platform.use is True and c.platform.learn_s > 0.0:
             self._learner = MotionLearner(
                 c.platform.learn_s,
@@ -136,7 +121,7 @@ class LandingEstimator:
     @property
     def sensors(self) -> tuple[str, ...]:
         """The names that the records' sensor indices mean."""
-        return tuple(self._names.sensors)
+        return tuple(self._intake.names.sensors)
 
     @property
     def origin(self) -> Array | None:
@@ -145,14 +130,14 @@ class LandingEstimator:
 
     def clocks(self, at_ns: int) -> list[ClockSummary]:
         """Return every other clock against the inertial one, at a time of that clock."""
-        return self._clocks.summary(at_ns)
+        return self._intake.clocks.summary(at_ns)
 
     def inertial_time_ns(self, clock: str, stamp_ns: int) -> int | None:
         """Return a stamp of a clock on the inertial clock, as known by now; None where nothing connects them.
 
         Latency is not corrected, and nothing of the estimator's state changes.
         """
-        reading = self._clocks.look(clock, stamp_ns)
+        reading = self._intake.clocks.look(clock, stamp_ns)
         return None if reading is None else reading.time_ns
 
     def add_sensor(self, name: str, model: Model, latency_s: float = 0.0) -> None:
@@ -165,24 +150,25 @@ class LandingEstimator:
             raise ConfigError(
                 f"sensor {name!r}: needs engine='filterpy'; the compiled engine has no user models"
             )
-        self._models[name] = (model, latency_s)
+        self._models[name] = model
+        self._intake.latency_of[name] = latency_s
 
     def step(self, event: Event) -> Output:
         """Take one event, in the order of arrival."""
         if self._engine is None:
-            self._take(np.array([pack(event, self._names)], dtype=EVENT_DTYPE))
+            self._take(self._intake.single(event))
         else:
             self._take_one(event)
         return self._output()
 
     def feed(self, batch: EventBatch) -> Output:
         """Take the events of a batch, in its order, as ``step`` would one by one; the last estimate is given out."""
-        self._take(self._named(batch), batch.timesync_reference)
+        self._take(self._intake.batch(batch))
         return self._output()
 
     def run(self, batch: EventBatch) -> Run:
         """Take a batch, in its order, to its end, and return all that it led to."""
-        self._take(self._named(batch), batch.timesync_reference)
+        self._take(self._intake.batch(batch))
         self.finish()
         return self._as_run(*self._collect())
 
@@ -239,57 +225,24 @@ class LandingEstimator:
 
     # -- intake ------------------------------------------------------------------------------------------------
 
-    def _named(self, batch: EventBatch) -> NDArray[np.void]:
-        """Return a batch's rows with the indices of this estimator's names."""
-        rows = batch.rows.copy()
-        sensors = np.array([self._names.sensor(s) for s in batch.sensors] or [0], dtype=np.int16)
-        clocks = np.array([self._names.clock(c) for c in batch.clocks] or [0], dtype=np.int16)
-        rows["sensor"] = sensors[batch.rows["sensor"]]
-        rows["clock"] = clocks[batch.rows["clock"]]
-        return rows
-
-    def _take(self, rows: NDArray[np.void], timesync_reference: str = COMPANION) -> None:
-        ids = self._next_id + np.arange(len(rows))
-        self._next_id += len(rows)
-        if len(rows) and self._utc_s == 0.0:
-            self._utc_s = float(rows["arrival_ns"][0]) * 1e-9
+    def _take(self, r: Rows) -> None:
+        if len(r) and self._utc_s == 0.0:
+            self._utc_s = float(r.arrival_ns[0]) * 1e-9
             self._aligner.utc_s = self._utc_s
-        t, known = self._content_times(rows, timesync_reference)
-        r = Rows.empty(len(rows))
-        r.t_ns[:], r.kind[:], r.sensor[:], r.id[:] = t, rows["kind"], rows["sensor"], ids
-        r.stamp_ns[:], r.arrival_ns[:] = rows["stamp_ns"], rows["arrival_ns"]
-        r.value[:], r.own[:] = rows["value"], rows["covariance"]
-        r.outcome[:] = malformed(r)
-        r.outcome[~known] = Outcome.REJECTED_NOT_READY
-        r = r.take(np.flatnonzero(r.kind != Kind.TIMESYNC))
         bad = r.outcome != PENDING
         self._ledger.reject(r.take(np.flatnonzero(bad)))
         self._feed(r.take(np.flatnonzero(~bad)))
 
     def _take_one(self, event: Event) -> None:
         """Take one event while the filter runs: what ``_take`` does, without columns of one entry."""
-        if isinstance(event, TimeSync):
-            self._next_id += 1
-            self._clocks.exchange(event)
+        row = self._intake.row(event)
+        if row is None:
             return
-        stamp, arrival, kind, sensor, _, value, own = pack(event, self._names)
-        number, t, known = self._next_id, stamp, True
-        self._next_id += 1
-        if event.clock != AUTOPILOT or kind == Kind.GPS_POSITION:
-            self._clocks.observe(event.clock, stamp, arrival)
-            reading = self._clocks.convert(event.clock, stamp)
-            known = reading is not None
-            t = stamp if reading is None else reading.time_ns
-        model = self._models.get(event.sensor)
-        t -= int(self._latency[kind]) if model is None else round(model[1] * 1e9)
-        outcome = malformed_one(kind, value, own) if known else int(Outcome.REJECTED_NOT_READY)
-        row = Rows.empty(1)
-        row.ints[0] = (t, kind, sensor, number, 0, stamp, arrival, 0, outcome, 0)
-        row.floats[0, VALUE:OWN], row.floats[0, OWN:RESULT] = value, own
-        if outcome != PENDING:
+        if row.ints[0, OUTCOME] != PENDING:
             self._ledger.reject(row)
             return
-        h, imu = self._history, kind == Kind.IMU
+        t = int(row.ints[0, T_NS])
+        h, imu = self._history, row.ints[0, KIND] == Kind.IMU
         newest = h.newest_ns
         assert newest is not None
         far = max(h.window_ns, int(self.config.imu.gap_s * 1e9)) if imu else h.window_ns
@@ -305,32 +258,6 @@ class LandingEstimator:
             self._ledger.reject(row, Outcome.REJECTED_DUPLICATE)
         if not late:
             self._advance()
-
-    def _content_times(
-        self, rows: NDArray[np.void], timesync_reference: str
-    ) -> tuple[Int, NDArray[np.bool_]]:
-        """Return the time of each event's content on the inertial clock, map(stamp) - latency, and where known."""
-        t: Int = rows["stamp_ns"].astype(np.int64)
-        known = np.ones(len(rows), dtype=bool)
-        home = self._names.clocks.index(AUTOPILOT)
-        kind = rows["kind"]
-        for i in np.flatnonzero(
-            (rows["clock"] != home) | (kind == Kind.TIMESYNC) | (kind == Kind.GPS_POSITION)
-        ):
-            event = unpack(rows[i], self._names.sensors, self._names.clocks, timesync_reference)
-            if isinstance(event, TimeSync):
-                self._clocks.exchange(event)
-                continue
-            self._clocks.observe(event.clock, event.stamp_ns, event.arrival_ns)
-            reading = self._clocks.convert(event.clock, event.stamp_ns)
-            known[i] = reading is not None
-            if reading is not None:
-                t[i] = reading.time_ns
-        latency = self._latency[rows["kind"]]
-        for name, (_, seconds) in self._models.items():
-            latency = np.where(rows["sensor"] == self._names.sensor(name), round(seconds * 1e9), latency)
-        result: Int = t - latency.astype(np.int64)
-        return result, known
 
     def _feed(self, r: Rows) -> None:
         """Take well-formed rows in the order of arrival."""
@@ -472,7 +399,7 @@ class LandingEstimator:
             return CompiledEngine.start(p, self.layout, state)
         from estimation.filter import FilterPyEngine
 
-        users = {self._names.sensor(name): model for name, (model, _) in self._models.items()}
+        users = {self._intake.names.sensor(name): model for name, model in self._models.items()}
         return FilterPyEngine.start(p, self.layout, state, users)
 
     def _new_aligner(self) -> None:
@@ -522,11 +449,11 @@ class LandingEstimator:
         )
         self._estimates.clear()
         self._heave.clear()  # a run's only: one is a megabyte
-        return Output(estimate, self._ledger.take_records(self._names), self._ledger.take_notes())
+        return Output(estimate, self._ledger.take_records(self._intake.names), self._ledger.take_notes())
 
     def _collect(self) -> tuple[Estimates, NDArray[np.void], list[tuple[int, str]]]:
         estimates = Estimates.concatenate(self._estimates, self.layout)
-        records = self._ledger.take_records(self._names)
+        records = self._ledger.take_records(self._intake.names)
         notes = self._ledger.take_notes()
         self._estimates.clear()
         return estimates, records, notes
@@ -539,28 +466,15 @@ class LandingEstimator:
             state_names=self.layout.names,
             state_units=self.layout.units,
             heave=list(self._heave),
-            clocks=self._clocks.summary(int(e.t_ns[-1]) if len(e.t_ns) else 0),
+            clocks=self._intake.clocks.summary(int(e.t_ns[-1]) if len(e.t_ns) else 0),
             records=records,
-            sensors=tuple(self._names.sensors),
+            sensors=tuple(self._intake.names.sensors),
             notes=notes,
             imu_outcomes=dict(self._ledger.imu_outcomes),
             origin=self._site.origin if self._site else None,
             declination_rad=self._site.declination_rad if self._site else None,
             missing="" if self._engine is not None else self._aligner.missing,
         )
-
-
-def latencies_s(config: Config, facts: Facts) -> Array:
-    """Return the age of each kind's content at its stamp [s], shape (len(Kind),)."""
-    latency = np.zeros(len(Kind))
-    latency[Kind.IMU] = facts.imu_latency_s if config.imu.latency_s is None else config.imu.latency_s
-    latency[Kind.GPS_POSITION] = latency[Kind.GPS_VELOCITY] = config.gps.latency_s
-    latency[Kind.BAROMETER] = config.barometer.latency_s
-    latency[Kind.MAGNETOMETER] = config.magnetometer.latency_s
-    latency[Kind.ATTITUDE] = config.attitude.latency_s
-    latency[Kind.RANGEFINDER] = config.rangefinder.latency_s
-    latency[Kind.VISION] = config.vision.latency_s
-    return latency
 
 
 def _choose(engine: EngineName) -> str:

@@ -16,9 +16,7 @@ from vision.lines import edges_of, usable_edges
 from vision.plane import LevelPlane, rotation_vector_xy, rotation_xy
 from vision.position import Positions
 from vision.refine import Fit, fit_profiles
-from vision.rings import (
-    Hypothesis,
-)
+from vision.rings import Hypothesis
 from vision.target import RingTarget
 from vision.thesis import thesis_detect
 
