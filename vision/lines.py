@@ -35,6 +35,10 @@ MIN_RADIUS_PX = 3.5
 HALF_LENGTH_PX = 3.2
 MIN_HALF_LENGTH_PX = 2.6
 MIN_LINES = 12
+ENOUGH_SEEN, LEAST_SEEN = 0.6, 0.03
+"""Share of the lines that lie in the image, below which more are laid; of a share below the second no more than for it:
+near the deck a few degrees of a ring may be all that is seen.
+"""
 CLIPPED_LEVEL = 253
 """Brightness from which a pixel says only that it was brighter."""
 STEP = 0.002
@@ -145,8 +149,8 @@ def lay_lines(
     edge, cos, sin, u, v = _place(view, centre, kappa, edges, usable, want)
     seen_line = inside(view, u[0], v[0], 1.5)
     seen = float(seen_line.mean())
-    if 0.0 < seen < 0.6:
-        edge, cos, sin, u, v = _place(view, centre, kappa, edges, usable, want / max(seen, 0.15))
+    if seen < ENOUGH_SEEN:
+        edge, cos, sin, u, v = _place(view, centre, kappa, edges, usable, want / max(seen, LEAST_SEEN))
         seen_line = inside(view, u[0], v[0], 1.5)
     if not seen_line.all():
         edge, cos, sin, u, v = (

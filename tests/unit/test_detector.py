@@ -50,6 +50,27 @@ def test_finds_the_target_near_and_far(target, height, bound):
     assert np.linalg.eigvalsh(fix.covariance_m2).min() > 0.0
 
 
+@pytest.mark.parametrize("engine", ["numpy", "compiled"])
+def test_near_the_deck_a_few_degrees_of_its_rings_are_enough(engine):
+    """0.3 m above a tilted one, its centre 0.15 or 0.18 m outside of the picture, with an error of the attitude."""
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    detector, errors = TargetDetector(CAMERA, RECOMMENDED, engine=engine), []
+    wrong = quat_to_matrix(euler_to_quat(0.005, -0.004, 0.0))
+    for out in (260.0, 320.0):
+        beside = ((100, -out), (500, 480 + out), (-out, 100), (640 + out, 400), (320, -out), (-out, 240))
+        for k, pixel in enumerate(beside):
+            for turn, tilt in ((0.0, (1.5, -1.0)), (77.0, (-1.0, 1.5)), (160.0, (2.0, 1.0))):
+                deck = quat_to_matrix(euler_to_quat(*np.radians([*tilt, 0.0])))
+                image, R_nc, truth = scene(RECOMMENDED, 0.3, 3.0, -2.0, 50.0 * k + turn, pixel, R_nd=deck)
+                fix = detector.detect(image, wrong @ R_nc, truth)
+                if isinstance(fix, VisionFix):
+                    errors.append(np.linalg.norm(fix.position_cam_m - truth) / np.linalg.norm(truth))
+    assert len(errors) >= 24
+    assert np.median(errors) < 2e-3
+    assert max(errors) < 1e-2
+
+
 def test_covariance_grows_with_distance():
     sigmas = []
     for height in (1.0, 3.0, 10.0, 30.0):

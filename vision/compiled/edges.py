@@ -17,10 +17,12 @@ from vision.lines import (
     CONSIDERED,
     DESIGN,
     DISTANCE,
+    ENOUGH_SEEN,
     GAP_PX,
     HALF_PX,
     INWARD_BEND,
     INWARD_PX,
+    LEAST_SEEN,
     LEVEL,
     MIN_LINES,
     NU,
@@ -96,9 +98,9 @@ def _lay_lines(
                         row[U0], row[V0], row[NU], row[NV] = u0, v0, cos, sin
                         n += 1
             seen = n / max(laid, 1)
-            if attempt == 1 or not 0.0 < seen < 0.6:
+            if attempt == 1 or seen >= ENOUGH_SEEN:
                 break
-            want = want / max(seen, 0.15)
+            want = want / max(seen, LEAST_SEEN)
         if n < MIN_LINES:
             return empty_lines(0)
         outward, inward = neighbours(edges)
