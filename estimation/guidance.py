@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 FOLLOW_MPS2 = 2.0
 """Over the deck the vehicle comes to rest at the target with no more than this."""
+LEAST_ROOM_M = 0.1
+"""Over less than this the climb to the holding height is not slowed down further."""
 CONTACT_SPREAD_S = 0.3
 """A quiet moment lasts from this long before the contact expected until this long after it."""
 
@@ -190,7 +192,8 @@ def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
     if p.descent_ns is None:
         aim = np.array([0.0, 0.0, -c.hold_height_m])
         # From the deck up at the rate of an abort.
-        gain = c.position_gain if height > c.hold_height_m else c.climb_mps / (c.hold_height_m - c.gear_m)
+        room = max(c.hold_height_m - c.gear_m, LEAST_ROOM_M)
+        gain = c.position_gain if height > c.hold_height_m else c.climb_mps / room
         descent = min(c.approach_rate_mps, max(-c.climb_mps, gain * (height - c.hold_height_m)))
     else:
         aim = np.array([0.0, 0.0, -c.gear_m])

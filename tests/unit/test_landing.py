@@ -152,6 +152,9 @@ def test_from_the_deck_the_vehicle_rises_as_fast_as_it_would_in_an_abort() -> No
     for height, climb in ((c.gear_m, c.climb_mps), (c.hold_height_m, 0.0)):
         seen = Situation(10**9, estimate(10**9, (0.0, 0.0, -height), 0.3), 0.6, forecast(10**9, 0.3))
         assert step(landing(False), seen, c)[1].velocity_mps[2] == pytest.approx(-climb - 0.3)
+    low = replace_field(c, gear_m=0.5, blind_height_m=0.5, hold_height_m=0.5)
+    seen = Situation(10**9, estimate(10**9, (0.0, 0.0, -0.4)), 0.6)
+    assert step(landing(False), seen, low)[1].velocity_mps[2] == pytest.approx(-c.climb_mps)
 
 
 @pytest.mark.parametrize(("closing_mps", "stays"), [(0.25, True), (0.0, False)])
