@@ -1,8 +1,10 @@
-"""The deck a few seconds ahead of the estimate, from the filter's own heave states.
+"""The deck a few seconds ahead of the estimate, from the filter's own states: its height and rate, its horizontal
+velocity, and how well the vehicle's place relative to it will be known.
 
 The heave block is linear, x' = f x + l w, so that what is known of it at a time h later is exact:
 x(h) = F x, covariance F P F' + S - F S F' with F = exp(f h) and S the block's covariance in a sea without end. With
 growing h the forecast goes over into what is known of the sea alone; it is never worse than that.
+Horizontally the sway's blocks are of the same kind; the place is derived in docs/concepts.md.
 """
 
 from __future__ import annotations
