@@ -10,9 +10,8 @@ target, as an autopilot's precision landing does; "slow blind" goes down at the 
 use relative to the deck, to tell what is gained by going down slowly from what is gained by following the deck.
 ``--full`` flies 200 in each sea.
 
-Printed are the touchdowns inside r_land, the descents broken off for the holding height, the aborts, the horizontal miss
-and the speed into the deck at first contact. A first contact while the vehicle is on its way up counts as none of a
-descent.
+Printed are the touchdowns inside r_land, the descents broken off for the holding height, the aborts, the horizontal
+miss and the speed into the deck at first contact. A first contact on the way up counts as none of a descent.
 Exit status 1 when a target is missed, unless --no-gate is given.
 """
 
