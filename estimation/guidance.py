@@ -25,6 +25,11 @@ FOLLOW_MPS2 = 2.0
 """Over the deck the vehicle comes to rest at the target with no more than this."""
 LEAST_ROOM_M = 0.1
 """Over less than this the climb to the holding height is not slowed down further."""
+LEGS_M = 0.1
+"""A leg may touch so much before the vehicle stands: the deck and the vehicle are tilted, and legs give."""
+PRESS_MPS = 1.0
+"""What the deck holds up is asked to go down so much faster than it goes: more than a deck's rate changes by within the
+vehicle's answer, so that it stays on a deck that begins to fall, and its falling short of it can be told."""
 CONTACT_SPREAD_S = 0.3
 """A quiet moment lasts from this long before the contact expected until this long after it."""
 
@@ -132,6 +137,17 @@ def probably_met(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -
     return 0.5 * math.erfc(left / math.sqrt(2.0 * variance))
 
 
+def held_up(p: Progress, e: Estimate, c: LandingConfig) -> bool:
+    """Tell whether something holds the vehicle up where the deck may be: it falls short of the descent that it should
+    have answered with by more than ``stopped_mps``, no further from the deck than its height is known.
+    """
+    if p.answer_mps is None:
+        return False
+    above = -float(e.deck[2]) - c.gear_m
+    near = above < LEGS_M + 3.0 * math.sqrt(max(float(e.deck_covariance[2, 2]), 0.0))
+    return near and p.answer_mps - float(e.velocity_mps[2]) > c.stopped_mps
+
+
 def tilt_rad(e: Estimate) -> float:
     """Return the angle [rad] between the vehicle's vertical and the world's."""
     return math.acos(max(-1.0, min(1.0, float(quat_to_matrix(e.quaternion)[2, 2]))))
@@ -199,8 +215,20 @@ def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
         aim = np.array([0.0, 0.0, -c.gear_m])
         descent = descent_rate(height, c)
     velocity[2] = descent - deck_rate_ahead(e, seen.forecast, c.response_s)
+    if p.descent_ns is not None:
+        velocity[2] = max(float(velocity[2]), _pressing(p, seen, e, c))
     inside, quiet = probably_inside(e, c.r_land_m), probably_quiet(e, seen.forecast, c)
     return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.land_tilt_rad, aim, inside, quiet)
+
+
+def _pressing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> float:
+    """Return the least velocity, down, that is asked for: a vehicle that may stand wants to go down, which its landing
+    detector asks for, and one that the deck holds up is pressed onto it, which it would leave it otherwise.
+    """
+    if held_up(p, e, c):
+        return max(c.touchdown_rate_mps, float(e.velocity_mps[2]) + PRESS_MPS)
+    expected = p.met_ns is not None and (seen.now_ns - p.met_ns) * 1e-9 >= c.response_s
+    return c.touchdown_rate_mps if expected else -math.inf
 
 
 def descent_rate(height_m: float, c: LandingConfig) -> float:

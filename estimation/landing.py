@@ -23,6 +23,7 @@ import numpy as np
 from estimation.guidance import (
     decide,
     heading_rad,
+    held_up,
     probably_inside,
     probably_inside_at_contact,
     probably_met,
@@ -47,8 +48,8 @@ ALIGNED_S = 1.0
 ALTITUDE_SHARE = 0.1
 """Tracking altitude counts as reached within this share of it, and half a metre."""
 HOLD_TOLERANCE_M = 0.2
-OVERDUE_S = 0.3
-"""Contact is overdue where it has been probable for so long."""
+OVERDUE_S = 0.5
+"""Contact may come so much later than it was expected at: what the height's error takes at the touchdown's rate."""
 LONGEST_DESCENT = 4.0
 """A last descent that takes longer than this multiple of what it should take is broken off."""
 STATION_M = 3.0
@@ -64,8 +65,10 @@ _OVER_THE_DECK = (Mode.TRACKING, Mode.OBSERVATION, Mode.LANDING)
 
 def step(before: Progress, seen: Situation, c: LandingConfig) -> tuple[Progress, Decision]:
     """Return the next state of the landing and what to do. Same arguments, same result."""
+    before = _answered(before, seen, c)
     after = _followed(before, _transition(before, seen, c), seen, c)
-    return after, decide(after, seen, c)
+    decision = decide(after, seen, c)
+    return replace(after, asked_mps=float(decision.velocity_mps[2])), decision
 
 
 # -- transitions ---------------------------------------------------------------------------------------------------
@@ -150,18 +153,29 @@ def _observation(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) ->
 
 def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Progress:
     height = -float(e.deck[2])
-    lost = seen.detection_age_s > c.lost_s and height > c.blind_height_m
+    stopped = p.descent_ns is not None and held_up(p, e, c)
+    lost = seen.detection_age_s > c.lost_s and height > c.blind_height_m and not stopped
     if lost and (p.rose_ns is None or (seen.now_ns - p.rose_ns) * 1e-9 > c.lost_s):
         return _abort(p, Reason.TARGET_LOST, seen)
     if tilt_rad(e) > c.abort_tilt_rad:
         return _abort(p, Reason.TILTED, seen)
     fall_s = time_to_contact(c.hold_height_m, c)
     if p.descent_ns is not None:
+        if (seen.now_ns - p.descent_ns) * 1e-9 > LONGEST_DESCENT * fall_s + c.contact_s:
+            return _abort(p, Reason.NO_CONTACT, seen)
         met = probably_met(e, seen.forecast, c)
+        blind = seen.detection_age_s >= FRESH_S and height <= c.blind_height_m
+        # A vehicle that may stand is not led up again: the autopilot is given its time to tell. What is not held up by
+        # then has not met the deck where the estimate has it.
+        if stopped:
+            return replace(p, met_ns=seen.now_ns)
+        p = _holding(p, met > 0.5 or (blind and p.met_ns is not None), seen)
+        if blind and p.met_ns is not None:
+            late = _held_s(p, seen) > c.response_s + OVERDUE_S + c.contact_s
+            return _rise(p, Reason.NO_CONTACT, seen) if late else p
         # Judged is the place at contact: as far ahead as an answer takes while the target is in view, all the way
         # where it is not. A vehicle that stands before it has answered more probably than not, or more probably
         # than it stands outside, is not led up again for its place.
-        blind = seen.detection_age_s >= FRESH_S and height <= c.blind_height_m
         if blind:
             inside, asked = probably_inside_at_contact(e, seen.forecast, c), c.land_probability
         else:
@@ -169,12 +183,6 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
             inside, asked = probably_inside(e, c.r_land_m, ahead), c.abort_probability
         if inside < min(asked, 1.0 - met) and met < 0.5:
             return _rise(p, Reason.OUTSIDE_R_LAND, seen)
-        if (seen.now_ns - p.descent_ns) * 1e-9 > LONGEST_DESCENT * fall_s:
-            return _abort(p, Reason.NO_CONTACT, seen)
-        # Without sight of it, a deck that should have been met by now is not where the estimate has it.
-        p = _holding(p, blind and met > 0.5, seen)
-        if _held_s(p, seen) > OVERDUE_S:
-            return _rise(p, Reason.NO_CONTACT, seen)
         return p
     low = height < c.hold_height_m + HOLD_TOLERANCE_M
     p = _holding(p, low, seen)
@@ -238,6 +246,17 @@ def _held_s(p: Progress, seen: Situation) -> float:
 
 def _mode_s(p: Progress, seen: Situation) -> float:
     return (seen.now_ns - p.since_ns) * 1e-9
+
+
+def _answered(p: Progress, seen: Situation, c: LandingConfig) -> Progress:
+    """Carry on to now how fast down a vehicle that answers within ``response_s`` goes on what it was asked for."""
+    if p.stepped_ns is None or seen.estimate is None:
+        return replace(p, answer_mps=None)
+    if p.answer_mps is None:
+        return replace(p, answer_mps=float(seen.estimate.velocity_mps[2]))
+    dt = max((seen.now_ns - p.stepped_ns) * 1e-9, 0.0)
+    share = -math.expm1(-dt / c.response_s) if c.response_s > 0.0 else 1.0
+    return replace(p, answer_mps=p.answer_mps + share * (p.asked_mps - p.answer_mps))
 
 
 def _followed(before: Progress, after: Progress, seen: Situation, c: LandingConfig) -> Progress:

@@ -142,6 +142,20 @@ class LandingConfig(Table, frozen=True):
     response_level_s: Annotated[
         float, not_negative("the same of the horizontal velocity, for the deck's sway", "s")
     ] = 0.35
+    contact_s: Annotated[
+        float,
+        not_negative(
+            "longest time that the autopilot's landing detector takes to tell that the vehicle stands", "s"
+        ),
+    ] = 1.0
+    stopped_mps: Annotated[
+        float,
+        positive(
+            "a descent that falls so much short of the one asked for is held up by the deck; more than the vehicle's "
+            "own errors in following",
+            "m/s",
+        ),
+    ] = 0.2
     lost_s: Annotated[float, positive("the target is lost after this time without a fused fix", "s")] = 1.0
     stale_s: Annotated[float, positive("an estimate older than this is not flown on", "s")] = 0.3
     sigma_limit_m: Annotated[

@@ -44,7 +44,6 @@ TAKE_OFF_MPS = 1.5
 LAND_RATE_MPS = 0.5
 FAR_M = 2.5
 TARGET_LOST_S = 2.0
-DISARM_S = 1.0
 _GAIN = 0.8
 _FASTEST_MPS = 1.0
 _IDS = {
@@ -164,7 +163,7 @@ class Autopilot(World):
             return
         if self.mode == STABILIZE:
             self.mode = GUIDED
-        loaded = self._own[body.LOADED] > DISARM_S
+        loaded = self._own[body.LOADED] > LEGS_LOADED_S
         if self.mode == LAND and loaded:
             self.armed = False
         self._set[body.SET_MOTORS] = float(self.armed)

@@ -77,7 +77,8 @@ def pack(a: Airframe, gravity_mps2: float, deck_m: float) -> Array:
 # Places in the vehicle's state (17,): position, velocity, attitude (w x y z, body to NED), angular velocity (body),
 # thrust over mass and angular accelerations that the rotors give now.
 POS, VEL, QUAT, RATE, DRIVE, STATE_SIZE = 0, 3, 6, 10, 13, 17
-# What the autopilot holds (11,): velocity, attitude, velocity integral, time with weight on the legs [s].
+# What the autopilot holds (11,): velocity, attitude, velocity integral, time with weight on the legs while a descent is
+# wanted [s].
 EST_VEL, EST_QUAT, INTEGRAL, LOADED, OWN_SIZE = 0, 3, 7, 10, 11
 # A set-point (6,): velocity NED, yaw, largest tilt, motors on (1) or off (0).
 SET_VEL, SET_YAW, SET_TILT, SET_MOTORS, SET_SIZE = 0, 3, 4, 5, 6
@@ -252,7 +253,8 @@ def advance(
             own[EST_VEL + i] += (E[i, 0] * f[0] + E[i, 1] * f[1] + E[i, 2] * f[2]) * dt
         own[EST_VEL + 2] += p[GRAVITY] * dt
         own[EST_QUAT : EST_QUAT + 4] = _turned(own[EST_QUAT : EST_QUAT + 4], x[RATE : RATE + 3], dt)
-        own[LOADED] = own[LOADED] + dt if loaded > LEGS_SHARE * p[MASS] * p[GRAVITY] else 0.0
+        stands = loaded > LEGS_SHARE * p[MASS] * p[GRAVITY] and setpoint[SET_VEL + 2] > 0.0
+        own[LOADED] = own[LOADED] + dt if stands else 0.0
         _control(own, setpoint, x[RATE : RATE + 3], dt, p, wanted)
         for i in range(4):
             x[DRIVE + i] += (wanted[i] - x[DRIVE + i]) * (1.0 - math.exp(-dt / p[LAG]))

@@ -38,8 +38,8 @@ from simulation.wind import Turbulence
 TICK_S = 0.02
 STEPS = round(TICK_S * body.STEP_HZ)
 HORIZONS_S = np.arange(0.0, 8.01, 0.1)
-LEGS_LOADED_S = 0.2
-"""The landing detector speaks after so long with weight on the legs."""
+LEGS_LOADED_S = 1.0
+"""The landing detector speaks after so long with weight on the legs while a descent is wanted, as autopilots' do."""
 SETPOINT_TIMEOUT_S = 0.5
 """Without a set-point for so long the autopilot stops and hovers on its own estimate."""
 AFTER_LANDING_S = 2.0

@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 
 from estimation.modes import Mode, Reason
+from simulation import world
+from simulation.flight import WavesTable
 from simulation.mishaps import Mishap
 from simulation.mission import Mission, load_mission
+from simulation.sea import Wave
 from simulation.world import Flown, fly
 
 SEED = 1
@@ -122,6 +125,27 @@ def test_a_mishap_is_recovered_from_or_ends_the_landing(
 )
 def test_whatever_misleads_it_never_touches_down_beside_the_deck(mishap: Mishap, seed: int) -> None:
     on_the_deck_or_not_at_all(fly(mission(mishap), seed))
+
+
+@pytest.mark.parametrize(
+    ("seed", "detector_s"),
+    [
+        pytest.param(seed, detector_s, marks=[] if (seed, detector_s) == (3, 2.5) else pytest.mark.nightly)
+        for seed in range(1, 9)
+        for detector_s in (1.0, 2.5, 5.0)
+    ],
+)
+def test_what_stands_stays_until_a_slow_landing_detector_tells(
+    monkeypatch: pytest.MonkeyPatch, seed: int, detector_s: float
+) -> None:
+    """In a swell, on a deck that falls away and comes up again under the vehicle while the target is out of sight."""
+    monkeypatch.setattr(world, "LEGS_LOADED_S", detector_s)
+    swell = WavesTable(beaufort=3, waves=(Wave("swell", 0.4, 9.0, 0.2, 0.1),))
+    flown = fly(msgspec.structs.replace(mission(), sea=swell), seed)
+    assert flown.contact is not None
+    after = [(mode, reason) for t, mode, reason in flown.transitions if t > flown.contact.t_s]
+    assert after == [(Mode.LANDED, Reason.CONTACT)]
+    assert flown.transitions[-1][0] - flown.contact.t_s >= detector_s
 
 
 def test_a_jump_of_the_gps_does_not_lead_the_vehicle_down_beside_the_deck(told: Told) -> None:

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from estimation.ahead import DeckForecast
 from estimation.frames import euler_to_quat
 from estimation.guidance import (
+    PRESS_MPS,
     deck_rate_ahead,
+    held_up,
     inside_probability,
     probably_inside_at_contact,
     probably_met,
@@ -104,10 +106,14 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
                 assert decision.velocity_mps[2] < 0.0
         elif after.mode is Mode.LANDING and e is not None:
             height, rate = -e.deck[2], deck_rate_ahead(e, seen.forecast, C.response_s)
-            assert decision.velocity_mps[2] + rate <= C.approach_rate_mps + 1e-12
+            # At most 0.5 m/s relative to the deck; where it may stand, to the vehicle, which goes as the deck does.
+            pressed = after.met_ns is not None and after.descent_ns is not None
+            most = max(C.touchdown_rate_mps, e.velocity_mps[2] + PRESS_MPS) if pressed else -math.inf
+            assert decision.velocity_mps[2] <= max(most, C.approach_rate_mps - rate) + 1e-12
             if before.mode is Mode.LANDING:
                 risen = before.rose_ns is not None and seen.now_ns - before.rose_ns <= C.lost_s * 1e9
-                assert seen.detection_age_s <= C.lost_s or height <= C.blind_height_m or risen
+                stands = after.descent_ns is not None and held_up(after, e, C)
+                assert seen.detection_age_s <= C.lost_s or height <= C.blind_height_m or risen or stands
             if after.descent_ns is not None:
                 P, fresh = e.deck_covariance, before.descent_ns is None
                 # In the descent it is the place at contact that counts: in sight as far ahead as the vehicle takes to
@@ -119,9 +125,13 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
                 if blind and not fresh:
                     inside = probably_inside_at_contact(e, seen.forecast, C)
                 asked = C.land_probability if fresh or blind else C.abort_probability
-                # Nearer than it could answer it is not led up again.
+                # Nearer than it could answer, or where it may stand, it is not led up again.
                 met = 0.0 if fresh else probably_met(e, seen.forecast, C)
-                assert met >= 0.5 or inside >= min(asked, 1.0 - met) - 1e-9
+                assert after.met_ns is not None or inside >= min(asked, 1.0 - met) - 1e-9
+                if met < 0.5 and not blind and after.met_ns is not None:
+                    # In sight there is one more reason to hold that it stands: it does not go down as it is told.
+                    assert before.answer_mps is not None
+                    assert held_up(after, e, C)
         if after.mode is not before.mode:
             assert after.since_ns == seen.now_ns
         before = after

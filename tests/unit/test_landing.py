@@ -14,6 +14,7 @@ from estimation.frames import euler_to_quat
 from estimation.guidance import (
     FOLLOW_MPS2,
     descent_rate,
+    held_up,
     inside_probability,
     probably_inside_at_contact,
     probably_met,
@@ -32,11 +33,15 @@ HORIZON = np.arange(0.0, 6.0, 0.1)
 
 
 def estimate(
-    t_ns: int, relative: tuple[float, float, float], rate: float = 0.0, roll: float = 0.0
+    t_ns: int,
+    relative: tuple[float, float, float],
+    rate: float = 0.0,
+    roll: float = 0.0,
+    down_mps: float = 0.0,
 ) -> Estimate:
     deck = np.array([*relative, 0.0, 0.0, 0.0, 0.0, rate])
     return Estimate(
-        t_ns, np.array(relative), np.zeros(3), euler_to_quat(roll, 0.0, 0.3), 0.01 * np.eye(9),
+        t_ns, np.array(relative), np.array([0.0, 0.0, down_mps]), euler_to_quat(roll, 0.0, 0.3), 0.01 * np.eye(9),
         np.zeros(NOMINAL_SIZE), np.ones(36), deck, 1e-4 * np.eye(8),
     )  # fmt: skip
 
@@ -196,17 +201,77 @@ def test_without_sight_the_whole_way_to_the_deck_is_judged(
     assert probably_inside_at_contact(e, told, c) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("age_s", "stays"), [(0.1, True), (0.6, False)])
-def test_a_deck_that_should_have_been_met_by_now_is_risen_from_to_be_seen_again(
-    age_s: float, stays: bool
-) -> None:
+@pytest.mark.parametrize("age_s", [0.1, 0.6])
+def test_a_deck_that_should_have_been_met_by_now_is_risen_from_to_be_seen_again(age_s: float) -> None:
+    """Not before the autopilot has had its time to tell that it stands; in sight the deck is where it seems."""
     c = LandingConfig()
-    met = Situation(10**9, estimate(10**9, (0.0, 0.0, -0.08)), age_s)
-    p, _ = fly(landing(), OVERDUE_S, met, c)
+    given = c.response_s + OVERDUE_S + c.contact_s
+    met = Situation(10**9, estimate(10**9, (0.0, 0.0, -0.08), down_mps=0.25), age_s)
+    p, _ = fly(landing(), 0.1, met, c)
+    assert p.met_ns is not None
+    # Once contact was probable, an estimate that takes it back proves nothing out of sight.
+    away = replace(met, now_ns=p.met_ns, estimate=estimate(p.met_ns, (0.4, 0.0, -0.3), down_mps=0.25))
+    p, said = fly(p, given - 0.1, away if age_s > 0.4 else met, c)
     assert p.descent_ns is not None
-    p, said = fly(p, 0.1, replace(met, now_ns=10**9 + round(OVERDUE_S * 1e9)), c)
-    assert (p.descent_ns is not None) == stays
-    assert said.reason is (Reason.DECK_QUIET if stays else Reason.NO_CONTACT)
+    p, said = fly(p, 0.3, replace(met, now_ns=round((p.met_ns or 0) + (given - 0.1) * 1e9)), c)
+    assert said.reason is (Reason.DECK_QUIET if age_s < 0.4 else Reason.NO_CONTACT)
+    assert (p.descent_ns is None) == (age_s > 0.4)
+
+
+@pytest.mark.parametrize(
+    ("answer", "own", "height", "sigma", "held"),
+    [
+        (0.25, 0.0, 0.1, 0.01, True),
+        (0.25, 0.1, 0.1, 0.01, False),
+        (0.25, -0.4, 0.5, 0.01, False),
+        (0.25, -0.4, 0.5, 0.11, True),
+        (None, 0.0, 0.1, 0.01, False),
+    ],
+)
+def test_what_does_not_go_down_as_told_near_the_deck_is_held_up(
+    answer: float | None, own: float, height: float, sigma: float, held: bool
+) -> None:
+    e = estimate(0, (0.0, 0.0, -height), down_mps=own)
+    e.deck_covariance[2, 2] = sigma**2
+    assert held_up(replace(landing(), answer_mps=answer), e, LandingConfig()) == held
+
+
+def test_the_answer_expected_is_that_of_a_first_order_lag() -> None:
+    c = LandingConfig()
+    p = replace(landing(), stepped_ns=10**9, answer_mps=0.1, asked_mps=0.5)
+    now = 10**9 + 200_000_000
+    seen = Situation(now, estimate(now, (0.0, 0.0, -1.0), down_mps=0.2), 0.1)
+    p, said = step(p, seen, c)
+    assert p.answer_mps == pytest.approx(0.5 - 0.4 * math.exp(-0.2 / c.response_s))
+    assert p.asked_mps == said.velocity_mps[2]
+
+
+@pytest.mark.parametrize(("own_mps", "asked_mps"), [(0.3, 1.3), (-0.9, 0.25)])
+def test_a_vehicle_that_may_stand_is_pressed_onto_the_deck_and_not_led_up_for_its_place(
+    own_mps: float, asked_mps: float
+) -> None:
+    """The estimate has it 0.2 m over a deck that comes up, and beside the circle: out of sight that is a guess."""
+    c = LandingConfig()
+    e = estimate(10**9, (0.45, 0.0, -0.3), 0.5, down_mps=own_mps)
+    e.deck_covariance[2, 2] = 0.1**2
+    flying = replace(landing(), stepped_ns=10**9, asked_mps=own_mps, answer_mps=own_mps)
+    seen = Situation(10**9, e, 0.8, forecast(10**9, 0.5, growth_mps=0.5))
+    p, said = step(flying, seen, c)
+    assert (p.descent_ns, said.reason) == (None, Reason.OUTSIDE_R_LAND)
+    p, said = step(replace(flying, asked_mps=own_mps + 0.3, answer_mps=own_mps + 0.3), seen, c)
+    assert p.descent_ns is not None
+    assert said.velocity_mps[2] == pytest.approx(asked_mps)
+
+
+def test_where_contact_is_probable_a_descent_is_asked_for_whatever_the_deck_does() -> None:
+    c = LandingConfig()
+    e = estimate(10**9, (0.0, 0.0, -0.08), 0.6)
+    seen = Situation(10**9, e, 0.6, forecast(10**9, 0.6))
+    p, said = step(landing(), seen, c)
+    assert said.velocity_mps[2] == pytest.approx(c.touchdown_rate_mps - 0.6)
+    late = 10**9 + round((c.response_s + 0.01) * 1e9)
+    said = step(p, replace(seen, now_ns=late, estimate=replace(e, t_ns=late)), c)[1]
+    assert said.velocity_mps[2] == pytest.approx(c.touchdown_rate_mps)
 
 
 def test_after_a_rise_the_target_is_given_time_to_come_into_view() -> None:
