@@ -138,14 +138,14 @@ def probably_met(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -
 
 
 def held_up(p: Progress, e: Estimate, c: LandingConfig) -> bool:
-    """Tell whether something holds the vehicle up where the deck may be: it falls short of the descent that it should
-    have answered with by more than ``stopped_mps``, no further from the deck than its height is known.
+    """Tell whether something holds the vehicle up where the deck may be: its descent falls short of the slowest answer
+    to what was asked for by more than ``stopped_mps``, no further from the deck than its height is known.
     """
-    if p.answer_mps is None:
+    if p.answers_mps is None:
         return False
     above = -float(e.deck[2]) - c.gear_m
     near = above < LEGS_M + 3.0 * math.sqrt(max(float(e.deck_covariance[2, 2]), 0.0))
-    return near and p.answer_mps - float(e.velocity_mps[2]) > c.stopped_mps
+    return near and min(p.answers_mps) - float(e.velocity_mps[2]) > c.stopped_mps
 
 
 def tilt_rad(e: Estimate) -> float:

@@ -249,14 +249,19 @@ def _mode_s(p: Progress, seen: Situation) -> float:
 
 
 def _answered(p: Progress, seen: Situation, c: LandingConfig) -> Progress:
-    """Carry on to now how fast down a vehicle that answers within ``response_s`` goes on what it was asked for."""
+    """Carry on to now how fast down the vehicle goes on what it was asked for, between the quickest and the slowest
+    answer: a first-order lag of ``response_s``, and one whose acceleration is bounded by ``response_mps2`` besides.
+    """
     if p.stepped_ns is None or seen.estimate is None:
-        return replace(p, answer_mps=None)
-    if p.answer_mps is None:
-        return replace(p, answer_mps=float(seen.estimate.velocity_mps[2]))
+        return replace(p, answers_mps=None)
+    if p.answers_mps is None:
+        own = float(seen.estimate.velocity_mps[2])
+        return replace(p, answers_mps=(own, own))
     dt = max((seen.now_ns - p.stepped_ns) * 1e-9, 0.0)
     share = -math.expm1(-dt / c.response_s) if c.response_s > 0.0 else 1.0
-    return replace(p, answer_mps=p.answer_mps + share * (p.asked_mps - p.answer_mps))
+    quick, slow = (share * (p.asked_mps - answer) for answer in p.answers_mps)
+    slow = max(-c.response_mps2 * dt, min(c.response_mps2 * dt, slow))
+    return replace(p, answers_mps=(p.answers_mps[0] + quick, p.answers_mps[1] + slow))
 
 
 def _followed(before: Progress, after: Progress, seen: Situation, c: LandingConfig) -> Progress:

@@ -156,6 +156,14 @@ class LandingConfig(Table, frozen=True):
             "m/s",
         ),
     ] = 0.2
+    response_mps2: Annotated[
+        float,
+        positive(
+            "vertical acceleration that the vehicle answers with at least where its velocity is off; ArduPilot's "
+            "WPNAV_ACCEL_Z",
+            "m/s^2",
+        ),
+    ] = 1.0
     lost_s: Annotated[float, positive("the target is lost after this time without a fused fix", "s")] = 1.0
     stale_s: Annotated[float, positive("an estimate older than this is not flown on", "s")] = 0.3
     sigma_limit_m: Annotated[

@@ -102,8 +102,8 @@ class Progress:
     ``rate_power_m2ps2`` is the mean square of the deck's rate over the ``rate_count`` steps of the observation.
     ``losses`` counts how often the target was lost again before a landing.
     ``drift_mps`` north and east is added against an error that lasts, ``stepped_ns`` when that was last
-    corrected. ``asked_mps`` is the vertical velocity asked for last, ``answer_mps`` what a vehicle that answers
-    as configured goes at by now (None: unknown), down.
+    corrected. ``asked_mps`` is the vertical velocity asked for last, ``answers_mps`` the quickest and the
+    slowest that a vehicle goes on it by now (None: unknown), down.
     """
 
     mode: Mode = Mode.IDLE
@@ -121,7 +121,7 @@ class Progress:
     drift_mps: tuple[float, float] = (0.0, 0.0)
     stepped_ns: int | None = None
     asked_mps: float = 0.0
-    answer_mps: float | None = None
+    answers_mps: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

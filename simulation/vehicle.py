@@ -35,7 +35,8 @@ class Airframe(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=
 
     ``rotor_lag_s`` of thrust and torque; ``drag_per_s`` linear drag of the rotors over mass, across and along the rotor
     axis; ``rotor_radius_m`` for the ground effect; ``gear_m`` the inertial sensor above the feet, which are ``feet_m``
-    from the axis; velocity gains [1/s, 1/s^2] across and along the vertical, attitude and rate gains [1/s].
+    from the axis; velocity gains [1/s, 1/s^2] across and along the vertical, attitude and rate gains [1/s];
+    ``climb_mps2`` largest vertical acceleration that the controller asks for, either way.
     """
 
     mass_kg: _Positive = 2.0
@@ -53,12 +54,13 @@ class Airframe(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=
     velocity_integral: tuple[float, float] = (1.0, 1.5)
     attitude_gain: tuple[float, float] = (8.0, 2.5)
     rate_gain: tuple[float, float] = (22.0, 6.0)
+    climb_mps2: _Positive = 10.0
 
 
 (
     MASS, _JX, _JY, _JZ, RATIO, LAG, DRAG, DRAG_Z, ROTOR, GEAR, FEET, STIFF, DAMP, FRICTION, KV, KVZ, KI, KIZ, KA, KAZ,
-    KR, KRZ, GRAVITY, DECK_HALF,
-) = range(24)  # fmt: skip
+    KR, KRZ, GRAVITY, DECK_HALF, CLIMB,
+) = range(25)  # fmt: skip
 """Places of the parameters in ``pack``."""
 
 
@@ -69,7 +71,7 @@ def pack(a: Airframe, gravity_mps2: float, deck_m: float) -> Array:
         [
             a.mass_kg, *a.inertia_kgm2, a.thrust_ratio, a.rotor_lag_s, *a.drag_per_s, a.rotor_radius_m, a.gear_m,
             a.feet_m, a.leg_stiffness_npm, a.leg_damping_nspm, a.friction, *(g for pair in pairs for g in pair),
-            gravity_mps2, 0.5 * deck_m,
+            gravity_mps2, 0.5 * deck_m, a.climb_mps2,
         ]
     )  # fmt: skip
 
@@ -129,6 +131,7 @@ def _control(own: Array, setpoint: Array, gyro: Array, dt: float, p: Array, driv
         a[i] = k * error + own[INTEGRAL + i]
     # Up is bounded by the thrust there is, down by what keeps the rotors turning.
     a[2] = min(0.7 * p[GRAVITY], max(-0.6 * (p[RATIO] - 1.0) * p[GRAVITY], a[2]))
+    a[2] = min(p[CLIMB], max(-p[CLIMB], a[2]))
     lift = p[GRAVITY] - a[2]
     limit = lift * math.tan(setpoint[SET_TILT])
     level = math.sqrt(a[0] * a[0] + a[1] * a[1])

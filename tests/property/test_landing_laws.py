@@ -130,7 +130,7 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
                 assert after.met_ns is not None or inside >= min(asked, 1.0 - met) - 1e-9
                 if met < 0.5 and not blind and after.met_ns is not None:
                     # In sight there is one more reason to hold that it stands: it does not go down as it is told.
-                    assert before.answer_mps is not None
+                    assert before.answers_mps is not None
                     assert held_up(after, e, C)
         if after.mode is not before.mode:
             assert after.since_ns == seen.now_ns

@@ -221,28 +221,30 @@ def test_a_deck_that_should_have_been_met_by_now_is_risen_from_to_be_seen_again(
 @pytest.mark.parametrize(
     ("answer", "own", "height", "sigma", "held"),
     [
-        (0.25, 0.0, 0.1, 0.01, True),
-        (0.25, 0.1, 0.1, 0.01, False),
-        (0.25, -0.4, 0.5, 0.01, False),
-        (0.25, -0.4, 0.5, 0.11, True),
+        ((0.25, 0.3), 0.0, 0.1, 0.01, True),
+        ((0.25, 0.3), 0.1, 0.1, 0.01, False),
+        ((0.3, 0.1), 0.0, 0.1, 0.01, False),
+        ((0.25, 0.3), -0.4, 0.5, 0.01, False),
+        ((0.25, 0.3), -0.4, 0.5, 0.11, True),
         (None, 0.0, 0.1, 0.01, False),
     ],
 )
 def test_what_does_not_go_down_as_told_near_the_deck_is_held_up(
-    answer: float | None, own: float, height: float, sigma: float, held: bool
+    answer: tuple[float, float] | None, own: float, height: float, sigma: float, held: bool
 ) -> None:
     e = estimate(0, (0.0, 0.0, -height), down_mps=own)
     e.deck_covariance[2, 2] = sigma**2
-    assert held_up(replace(landing(), answer_mps=answer), e, LandingConfig()) == held
+    assert held_up(replace(landing(), answers_mps=answer), e, LandingConfig()) == held
 
 
-def test_the_answer_expected_is_that_of_a_first_order_lag() -> None:
+def test_the_answer_lies_between_a_lag_and_one_of_bounded_acceleration() -> None:
     c = LandingConfig()
-    p = replace(landing(), stepped_ns=10**9, answer_mps=0.1, asked_mps=0.5)
+    p = replace(landing(), stepped_ns=10**9, answers_mps=(0.1, -0.2), asked_mps=0.5)
     now = 10**9 + 200_000_000
     seen = Situation(now, estimate(now, (0.0, 0.0, -1.0), down_mps=0.2), 0.1)
     p, said = step(p, seen, c)
-    assert p.answer_mps == pytest.approx(0.5 - 0.4 * math.exp(-0.2 / c.response_s))
+    quick = 0.5 - 0.4 * math.exp(-0.2 / c.response_s)
+    assert p.answers_mps == pytest.approx((quick, -0.2 + 0.2 * c.response_mps2))
     assert p.asked_mps == said.velocity_mps[2]
 
 
@@ -254,11 +256,13 @@ def test_a_vehicle_that_may_stand_is_pressed_onto_the_deck_and_not_led_up_for_it
     c = LandingConfig()
     e = estimate(10**9, (0.45, 0.0, -0.3), 0.5, down_mps=own_mps)
     e.deck_covariance[2, 2] = 0.1**2
-    flying = replace(landing(), stepped_ns=10**9, asked_mps=own_mps, answer_mps=own_mps)
+    flying = replace(landing(), stepped_ns=10**9, asked_mps=own_mps, answers_mps=(own_mps, own_mps))
     seen = Situation(10**9, e, 0.8, forecast(10**9, 0.5, growth_mps=0.5))
     p, said = step(flying, seen, c)
     assert (p.descent_ns, said.reason) == (None, Reason.OUTSIDE_R_LAND)
-    p, said = step(replace(flying, asked_mps=own_mps + 0.3, answer_mps=own_mps + 0.3), seen, c)
+    p, said = step(
+        replace(flying, asked_mps=own_mps + 0.3, answers_mps=(own_mps + 0.5, own_mps + 0.3)), seen, c
+    )
     assert p.descent_ns is not None
     assert said.velocity_mps[2] == pytest.approx(asked_mps)
 
