@@ -36,7 +36,7 @@ class Airframe(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=
     ``rotor_lag_s`` of thrust and torque; ``drag_per_s`` linear drag of the rotors over mass, across and along the rotor
     axis; ``rotor_radius_m`` for the ground effect; ``gear_m`` the inertial sensor above the feet, which are ``feet_m``
     from the axis; velocity gains [1/s, 1/s^2] across and along the vertical, attitude and rate gains [1/s];
-    ``climb_mps2`` largest vertical acceleration that the controller asks for, either way.
+    ``climb_mps2`` the acceleration that a vertical velocity set-point is led up to with (ArduPilot's WPNAV_ACCEL_Z).
     """
 
     mass_kg: _Positive = 2.0
@@ -54,7 +54,7 @@ class Airframe(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=
     velocity_integral: tuple[float, float] = (1.0, 1.5)
     attitude_gain: tuple[float, float] = (8.0, 2.5)
     rate_gain: tuple[float, float] = (22.0, 6.0)
-    climb_mps2: _Positive = 10.0
+    climb_mps2: _Positive = 100.0
 
 
 (
@@ -79,9 +79,9 @@ def pack(a: Airframe, gravity_mps2: float, deck_m: float) -> Array:
 # Places in the vehicle's state (17,): position, velocity, attitude (w x y z, body to NED), angular velocity (body),
 # thrust over mass and angular accelerations that the rotors give now.
 POS, VEL, QUAT, RATE, DRIVE, STATE_SIZE = 0, 3, 6, 10, 13, 17
-# What the autopilot holds (11,): velocity, attitude, velocity integral, time with weight on the legs while a descent is
-# wanted [s].
-EST_VEL, EST_QUAT, INTEGRAL, LOADED, OWN_SIZE = 0, 3, 7, 10, 11
+# What the autopilot holds (12,): velocity, attitude, velocity integral, time with weight on the legs while a descent is
+# wanted [s], the vertical velocity that it is led to.
+EST_VEL, EST_QUAT, INTEGRAL, LOADED, LED, OWN_SIZE = 0, 3, 7, 10, 11, 12
 # A set-point (6,): velocity NED, yaw, largest tilt, motors on (1) or off (0).
 SET_VEL, SET_YAW, SET_TILT, SET_MOTORS, SET_SIZE = 0, 3, 4, 5, 6
 # One row of the truth: position, velocity, attitude, angular velocity, specific force.
@@ -124,14 +124,14 @@ def _control(own: Array, setpoint: Array, gyro: Array, dt: float, p: Array, driv
         own[INTEGRAL : INTEGRAL + 3] = 0.0
         return
     a = np.empty(3)
+    own[LED] += min(p[CLIMB] * dt, max(-p[CLIMB] * dt, setpoint[SET_VEL + 2] - own[LED]))
     for i in range(3):
         k, ki = (p[KVZ], p[KIZ]) if i == 2 else (p[KV], p[KI])
-        error = setpoint[SET_VEL + i] - own[EST_VEL + i]
+        error = (own[LED] if i == 2 else setpoint[SET_VEL + i]) - own[EST_VEL + i]
         own[INTEGRAL + i] = min(4.0, max(-4.0, own[INTEGRAL + i] + ki * error * dt))
         a[i] = k * error + own[INTEGRAL + i]
     # Up is bounded by the thrust there is, down by what keeps the rotors turning.
     a[2] = min(0.7 * p[GRAVITY], max(-0.6 * (p[RATIO] - 1.0) * p[GRAVITY], a[2]))
-    a[2] = min(p[CLIMB], max(-p[CLIMB], a[2]))
     lift = p[GRAVITY] - a[2]
     limit = lift * math.tan(setpoint[SET_TILT])
     level = math.sqrt(a[0] * a[0] + a[1] * a[1])
