@@ -148,6 +148,20 @@ def test_what_stands_stays_until_a_slow_landing_detector_tells(
     assert flown.transitions[-1][0] - flown.contact.t_s >= detector_s
 
 
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_a_vehicle_that_answers_slowly_is_not_taken_for_one_that_stands(seed: int) -> None:
+    """One whose vertical velocity is led up to what is asked for with 1 m/s^2: a step of it is not a contact."""
+    base = mission()
+    slow = msgspec.structs.replace(base.airframe, climb_mps2=1.0)
+    flown = fly(msgspec.structs.replace(base, sea=WavesTable(beaufort=3), airframe=slow), seed)
+    on_the_deck_or_not_at_all(flown)
+    assert flown.contact is not None
+    assert flown.contact.speed_mps < 1.0
+    after = [mode for t, mode, _ in flown.transitions if t > flown.contact.t_s]
+    assert after == [Mode.LANDED]
+
+
 def test_a_jump_of_the_gps_does_not_lead_the_vehicle_down_beside_the_deck(told: Told) -> None:
     jump = Mishap(kind="gps_jump", start_s=told.landing + 1.0, offset_m=(15.0, 0.0, 0.0))
     flown = fly(mission(jump, longest_s=told.landing + 12.0), SEED)

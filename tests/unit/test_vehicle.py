@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from estimation.frames import quat_to_matrix
 from simulation.vehicle import (
+    CLIMB,
     EST_QUAT,
     LOADED,
     OWN_SIZE,
@@ -17,6 +18,7 @@ from simulation.vehicle import (
     SET_MOTORS,
     SET_SIZE,
     SET_TILT,
+    SET_VEL,
     STATE_SIZE,
     STEP_HZ,
     Airframe,
@@ -53,6 +55,17 @@ class Bench:
             )  # fmt: skip
             rows.append(truth)
         return np.concatenate(rows)
+
+
+def test_a_vertical_velocity_is_led_up_to_with_bounded_acceleration() -> None:
+    bench = Bench()
+    bench.p[CLIMB] = 1.0
+    bench.setpoint[SET_VEL + 2] = -2.0
+    rates = bench.fly(4.0)[:, 5]
+    half = np.flatnonzero(rates < -1.0)[0] / STEP_HZ
+    assert half == pytest.approx(1.1, abs=0.1)
+    assert np.abs(np.diff(rates)).max() * STEP_HZ < 1.5
+    assert rates[-1] == pytest.approx(-2.0, abs=0.05)
 
 
 def test_it_hovers_in_wind_and_follows_velocities() -> None:
