@@ -139,7 +139,8 @@ def probably_met(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -
 
 def held_up(p: Progress, e: Estimate, c: LandingConfig) -> bool:
     """Tell whether something holds the vehicle up where the deck may be: its descent falls short of the slowest answer
-    to what was asked for by more than ``stopped_mps``, no further from the deck than its height is known.
+    to what was asked for by more than ``stopped_mps`` [m/s], no further from the deck than its height is known to three
+    sigma (docs/concepts.md, landing modes).
     """
     if p.answers_mps is None:
         return False
@@ -223,7 +224,7 @@ def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
 
 def _pressing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> float:
     """Return the least velocity, down, that is asked for: a vehicle that may stand wants to go down, which its landing
-    detector asks for, and one that the deck holds up is pressed onto it, which it would leave it otherwise.
+    detector asks for, and one that the deck holds up is pressed onto it, or a deck that falls would leave it.
     """
     if held_up(p, e, c):
         return max(c.touchdown_rate_mps, float(e.velocity_mps[2]) + PRESS_MPS)
