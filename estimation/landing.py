@@ -84,7 +84,7 @@ def _transition(p: Progress, seen: Situation, c: LandingConfig) -> Progress:
         assert seen.estimate is not None
         yaw = heading_rad(seen.estimate)
         return replace(_enter(p, Mode.SEARCH, Reason.STARTED, seen), yaw_rad=yaw)
-    if seen.on_deck and p.mode is Mode.LANDING and p.descent_ns is not None:
+    if seen.on_deck and _may_have_met(p, seen, c):
         return _enter(p, Mode.LANDED, Reason.CONTACT, seen)
     if trouble is not None:
         # An abort goes on as it is; its reason is the one that it began with.
@@ -197,6 +197,16 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
     if waited > 2.0 * c.wait_s or _mode_s(p, seen) > 60.0 + 2.0 * c.wait_s:
         return _abort(p, Reason.NEVER_INSIDE_R_LAND, seen)
     return p
+
+
+def _may_have_met(p: Progress, seen: Situation, c: LandingConfig) -> bool:
+    """Tell whether contact that the autopilot tells of can be that of a descent: of one that goes on, or was broken off
+    no longer ago than a landing detector takes.
+    """
+    if p.mode is not Mode.LANDING:
+        return False
+    late = p.rose_ns is not None and (seen.now_ns - p.rose_ns) * 1e-9 <= c.contact_s
+    return p.descent_ns is not None or late
 
 
 def _aborting(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Progress:

@@ -218,6 +218,25 @@ def test_a_deck_that_should_have_been_met_by_now_is_risen_from_to_be_seen_again(
     assert (p.descent_ns is None) == (age_s > 0.4)
 
 
+@pytest.mark.parametrize(("told_after_s", "landed"), [(0.1, True), (0.9, True), (1.1, False)])
+def test_contact_told_late_is_taken_though_the_descent_was_broken_off(
+    told_after_s: float, landed: bool
+) -> None:
+    c = LandingConfig()
+    risen = replace(landing(descending=False), rose_ns=10**9, reason=Reason.OUTSIDE_R_LAND)
+    now = round((1.0 + told_after_s) * 1e9)
+    told = Situation(now, estimate(now, (0.4, 0.0, -0.3)), 0.8, on_deck=True)
+    p, said = step(risen, told, c)
+    assert (p.mode is Mode.LANDED) == landed
+    assert np.allclose(said.velocity_mps, 0.0) == landed
+
+
+def test_contact_told_before_any_descent_is_not_taken() -> None:
+    now = 10**9
+    told = Situation(now, estimate(now, (0.0, 0.0, -1.0)), 0.1, on_deck=True)
+    assert step(landing(descending=False), told, LandingConfig())[0].mode is Mode.LANDING
+
+
 @pytest.mark.parametrize(
     ("answer", "own", "height", "sigma", "held"),
     [
