@@ -28,17 +28,15 @@ from estimation.events import AUTOPILOT, EventBatch, Kind, TimeSync, unpack
 from estimation.intake import latencies_s
 from estimation.output import Facts, Run
 from estimation.parameters import chi_square_bound
-from estimation.update import MAX_LATENCY_S
+from estimation.update import MAX_LATENCY_S, MIN_LATENCY_S
 
 Array = NDArray[np.float64]
 KEY_DTYPE = np.dtype([("stamp_ns", np.int64), ("kind", np.int16), ("sensor", np.int16)])
 """What tells a measurement from the others: its own stamp, ``events.Kind`` and the sensor's index."""
 Replay = Callable[[float], tuple[NDArray[np.void], Array]]
 
-LOWEST_S = -0.03
-"""The profile begins here: a latency cannot be negative, but a wrong clock makes it look so, which is to be seen."""
 COARSE_S = 0.01
-"""Spacing of the first grid, which spans all from ``LOWEST_S`` to ``MAX_LATENCY_S``."""
+"""Spacing of the first grid, which spans all from ``MIN_LATENCY_S`` to ``MAX_LATENCY_S``."""
 MIDDLE_S = 0.003
 FINEST_S = 2e-4
 """Least spacing of the last grid: below it the rounding of the replays would show."""
@@ -153,7 +151,7 @@ def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:
     log-likelihood of each.
     """
     profile = _Profile(replay, jobs or os.cpu_count() or 1)
-    coarse = np.arange(LOWEST_S, MAX_LATENCY_S + 1e-9, COARSE_S)
+    coarse = np.arange(MIN_LATENCY_S, MAX_LATENCY_S + 1e-9, COARSE_S)
     profile.add(coarse)
     grid, stamps, values = profile.common()
     total = values.sum(axis=1)
@@ -162,7 +160,7 @@ def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:
     peak, sigma = _parabola(grid[best - 1 : best + 2], total[best - 1 : best + 2])
     for largest in (MIDDLE_S, MIDDLE_S / 2.0):
         step = float(np.clip(sigma, FINEST_S, largest))
-        middle = np.clip(peak, LOWEST_S + 2.0 * step, MAX_LATENCY_S - 2.0 * step)
+        middle = np.clip(peak, MIN_LATENCY_S + 2.0 * step, MAX_LATENCY_S - 2.0 * step)
         around = np.round(middle + step * np.arange(-2, 3), 9)
         profile.add(around)
         grid, stamps, values = profile.common()
@@ -341,8 +339,8 @@ def _judged(
         return inconsistent, f"the halves of the flight disagree: {first} and {second}"
     if not sigma <= KNOWN_S:
         return unobservable, HARDLY_TURNED
-    if not LOWEST_S < peak < MAX_LATENCY_S:
-        span = f"{LOWEST_S * 1e3:.0f} to {MAX_LATENCY_S * 1e3:.0f} ms"
+    if not MIN_LATENCY_S < peak < MAX_LATENCY_S:
+        span = f"{MIN_LATENCY_S * 1e3:.0f} to {MAX_LATENCY_S * 1e3:.0f} ms"
         return inconsistent, f"the likelihood still rises at the end of what is searched, {span}"
     if peak < -NEGATIVE_SIGMA * sigma:
         return (

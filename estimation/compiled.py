@@ -25,6 +25,7 @@ from estimation.algebra import (
     reset_attitude,
 )
 from estimation.band import BAND_SIZE
+from estimation.camera_age import noise_taken_out
 from estimation.codecache import jitted
 from estimation.deck import HEAVE, deck_output, no_steps, seen_place, take_up
 from estimation.frames import Array
@@ -78,6 +79,7 @@ from estimation.update import (
     extra_noise,
     hold_latency,
     interpolate,
+    learned_age,
     locked_out,
     reading_noise,
     reset_datum,
@@ -260,6 +262,8 @@ def _fuse(
         for i in range(first, stop):
             for j in range(first, stop):
                 P[i, j] = held[i - first, j - first]
+        if kind == VISION and learned_age(first, offsets):
+            x = noise_taken_out(x, P, S, R, w, scatter[1], p, offsets)
         hold_latency(x, p)
     return outcome, mark, x
 

@@ -190,8 +190,9 @@ def vision(
 ) -> int:
     """The target in the camera: P^c = (1 + s) R_cb exp(m)' (R_nb' (P_platform - P) - l), mount error m, scale s.
 
-    The age's Jacobian is its rotational part only, [b]x w with b the target in the body: its translational part
-    cannot be told from the platform's own motion and drives the age away over a swaying raft.
+    By age it changes as R_cm (R_nb' v - [b]x w), b being the target in the body: the vehicle was elsewhere and turned
+    otherwise. The platform's own part cannot be told from its motion, whose phase is free, and would drive the age
+    away over a swaying raft.
     """
     if offsets[PLATFORM_OFFSET] < 0:
         return -9
@@ -210,9 +211,9 @@ def vision(
     D = compose(R_cm, R_bn)
     T = compose(R_cm, skew(b))
     M = compose(R_cb, skew(seen))
-    turning = rotate(T, gyro)
+    aging = rotate(D, x[V0 : V0 + 3]) - rotate(T, gyro)
     for i in range(3):
-        r[i] = value[i] - scale * c[i] + turning[i] * x[CL0]
+        r[i] = value[i] - scale * c[i] - aging[i] * x[CL0]
         for j in range(3):
             H[i, offsets[POSITION] + j] = -scale * D[i, j]
             H[i, offsets[ATTITUDE] + j] = scale * T[i, j]
@@ -223,7 +224,7 @@ def vision(
         H[i, offsets[PLATFORM_LEVEL]] = -scale * D[i, 2]
         H[i, offsets[PLATFORM_HEAVE] + 5] = -scale * D[i, 2]
         H[i, offsets[RANGE_SCALE]] = c[i]
-        H[i, offsets[CAMERA_LATENCY]] = -turning[i]
+        H[i, offsets[CAMERA_LATENCY]] = aging[i]
     distance2 = max(1e-4, value[0] ** 2 + value[1] ** 2 + value[2] ** 2)
     floor = p[par.VISION_FLOOR] ** 2
     if own[0] == own[0]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimation import models, update
+from estimation.camera_age import noise_taken_out
 from estimation.deck import HEAVE, deck_output, no_steps, seen_place, take_up
 from estimation.frames import Array
 from estimation.outcome import Outcome
@@ -218,9 +219,11 @@ class FilterPyEngine:
         P[att : att + 3, :] = G @ P[att : att + 3, :]
         P[:, att : att + 3] = P[:, att : att + 3] @ G.T
         P[first:stop, first:stop] = held
+        s.P = 0.5 * (P + P.T)
+        if kind == models.VISION and update.learned_age(first, self.layout.offsets):
+            s.x = noise_taken_out(s.x, s.P, S, R, w, s.scatter[1], self.p, self.layout.offsets)
         if stop:
             update.hold_latency(s.x, self.p)
-        s.P = 0.5 * (P + P.T)
 
     def _update(self, r: Array, H: Array, R: Array) -> Array:
         """Let filterpy update the state's covariance; return the error state (n,)."""

@@ -16,6 +16,7 @@ from numba.extending import overload, register_jitable
 from estimation import (
     algebra,
     band,
+    camera_age,
     deck,
     frames,
     models,
@@ -96,7 +97,7 @@ def _put(target: Array, row: int, column: int, scale: float, block: Array) -> Ca
     return assign
 
 
-for _module in (algebra, band, deck, frames, models, relinearise, state, update, watch):
+for _module in (algebra, band, camera_age, deck, frames, models, relinearise, state, update, watch):
     for _function in vars(_module).values():
         if (
             inspect.isfunction(_function)
@@ -114,6 +115,20 @@ for _module in (algebra, band, deck, frames, models, relinearise, state, update,
         ):
             register_jitable(_function)
 
-_MODULES = (algebra, band, deck, frames, models, parameters, relinearise, rows, state, trail, update, watch)
+_MODULES = (
+    algebra,
+    band,
+    camera_age,
+    deck,
+    frames,
+    models,
+    parameters,
+    relinearise,
+    rows,
+    state,
+    trail,
+    update,
+    watch,
+)
 SOURCES = (*(Path(inspect.getfile(module)) for module in _MODULES), Path(__file__))
 """The files that compiled code is made from: code compiled of other contents is never used."""

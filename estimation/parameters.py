@@ -78,6 +78,7 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     LATENCY_WALK,
     LATENCY_RATE,
     LATENCY,
+    LATENCY_SIGMA,
     OFFSET_WALK,
     LEVEL_WALK,
     PRIOR_HEAVE,
@@ -88,7 +89,7 @@ from estimation.frames import R_CB_NOMINAL, Array, euler_to_quat, normal_gravity
     _,
     _,
     SIZE,
-) = range(74)
+) = range(75)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +140,8 @@ def pack_parameters(config: Config, site: Site) -> Array:
     p[VISION_LEVER : VISION_LEVER + 3] = v.lever_arm_m
     mount = quat_to_matrix(euler_to_quat(*v.mount_rpy_rad))
     p[VISION_MOUNT : VISION_MOUNT + 9] = (R_CB_NOMINAL @ mount.T).ravel()
-    p[LATENCY_WALK], p[LATENCY_RATE], p[LATENCY] = v.latency_walk, v.latency_rate_radps, v.latency_s
+    p[LATENCY_WALK], p[LATENCY_RATE] = v.latency_walk, v.latency_rate_radps
+    p[LATENCY], p[LATENCY_SIGMA] = v.latency_s, v.latency_sigma_s
     p[OFFSET_WALK] = d.offset_walk
     p[LEVEL_WALK] = d.level_walk
     if d.use is True:

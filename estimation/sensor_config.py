@@ -169,7 +169,7 @@ class VisionConfig(Table, frozen=True):
         Meta(ge=0.0, le=0.15, description="age of a fix at its stamp, as calibrated", extra={"unit": "s"}),
     ] = 0.0
     latency_sigma_s: Annotated[
-        float, positive("1-sigma of that age; the state that learns it stays within 0 to 0.15 s", "s")
+        float, positive("1-sigma of that age; the state that learns it stays within -0.03 to 0.15 s", "s")
     ] = 0.02
     arrival_latency_s: Annotated[
         float,

@@ -40,8 +40,9 @@ SCATTER_TIME_S = 1.0
 """Averaging time of the vibration measure [s]."""
 ROTATION_TIME_S = 5.0
 """Averaging time of the rotation that decides whether a camera's age can be learned [s]."""
-MAX_LATENCY_S = 0.15
-"""A camera's age stays between 0 and this [s]."""
+MIN_LATENCY_S, MAX_LATENCY_S = -0.03, 0.15
+"""A camera's age stays between these [s]. No content is newer than its stamp, but the age takes up what the map of the
+clocks errs by, too: up to half the round trip of its exchanges, where one way takes longer than the other."""
 RESET_COUNT = 5
 """Rejected measurements that must agree before a reset."""
 
@@ -135,9 +136,14 @@ def considered(kind: int, scatter: Array, p: Array, offsets: Offsets) -> tuple[i
     return start, offsets[CAMERA_MOUNT] + 3
 
 
+def learned_age(first: int, offsets: Offsets) -> bool:
+    """Tell from the first of the states that are only considered whether a fix moves the camera's age."""
+    return bool(first > offsets[CAMERA_LATENCY])
+
+
 def hold_latency(x: Array, p: Array) -> None:
     """Keep the camera's age, calibrated plus learned, within its box; in place."""
-    x[CL0] = min(max(x[CL0], -p[par.LATENCY]), MAX_LATENCY_S - p[par.LATENCY])
+    x[CL0] = min(max(x[CL0], MIN_LATENCY_S - p[par.LATENCY]), MAX_LATENCY_S - p[par.LATENCY])
 
 
 def locked_out(memory: Array, kind: int, t_s: float, r: Array, R: Array, dimension: int, p: Array) -> bool:

@@ -1,0 +1,119 @@
+"""What fixes tell of the camera's age, and what of it is the gyro's noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from estimation.camera_age import noise_taken_out, turned
+from estimation.config import parse_config
+from estimation.deck import vision
+from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_exp, quat_multiply, quat_to_matrix
+from estimation.parameters import Site, pack_parameters
+from estimation.state import CAMERA_LATENCY, CL0, P0, PL0, PO0, Q0, V0, Layout, nominal_zero
+
+CONFIG = parse_config("[platform]\nuse = true\n[vision]\nlever_arm_m = [0.1, -0.05, 0.2]\n")
+LAYOUT = Layout.of(CONFIG)
+P = pack_parameters(CONFIG, Site((0.9, 0.1, 50.0), 0.0))
+LEVER = np.array([0.1, -0.05, 0.2])
+RATE = np.array([0.4, -0.3, 0.2])
+AGE = LAYOUT.offsets[CAMERA_LATENCY]
+Array = NDArray[np.float64]
+
+
+def flying() -> Array:
+    """Return a state some metres over the platform, tilted, and on its way."""
+    x = nominal_zero()
+    x[P0 : P0 + 3], x[V0 : V0 + 3] = [3.0, -2.0, -6.0], [0.8, -1.1, 0.4]
+    x[PO0 : PO0 + 2], x[PL0] = [2.5, -1.0], 0.3
+    x[Q0 : Q0 + 4] = euler_to_quat(0.1, -0.15, 1.1)
+    return x
+
+
+def place_seen(x: Array, age_s: float) -> Array:
+    """Return P^c (3,) of a platform at rest as it was ``age_s`` ago, by rigid motion."""
+    position = x[P0 : P0 + 3] - x[V0 : V0 + 3] * age_s
+    attitude = quat_multiply(x[Q0 : Q0 + 4], quat_exp(-RATE * age_s))
+    platform = np.array([x[PO0], x[PO0 + 1], -x[PL0]])
+    seen: Array = R_CB_NOMINAL @ (quat_to_matrix(attitude).T @ (platform - position) - LEVER)
+    return seen
+
+
+def change(x: Array) -> Array:
+    """Return by how much what is seen changes per second of age (3,) [m/s]."""
+    step = 1e-5
+    difference: Array = (place_seen(x, step) - place_seen(x, -step)) / (2.0 * step)
+    return difference
+
+
+def test_a_fix_changes_with_its_age_as_the_vehicle_turned() -> None:
+    x = flying()
+    x[V0 : V0 + 3] = 0.0
+    assert -turned(x, P) @ RATE == pytest.approx(change(x), abs=1e-7)
+
+
+@pytest.mark.parametrize("age_s", [-0.02, 0.01, 0.04])
+def test_the_innovation_of_an_aged_fix_is_of_second_order(age_s: float) -> None:
+    x = flying()
+    value = place_seen(x, age_s)
+    x[CL0] = age_s
+    r, H, R = np.zeros(3), np.zeros((3, LAYOUT.size)), np.zeros((3, 3))
+    assert vision(value, np.full(6, math.nan), x, RATE, P, LAYOUT.offsets, r, H, R) == 3
+    first = np.linalg.norm(change(x)) * abs(age_s)
+    assert np.linalg.norm(r) < abs(age_s) * first
+    assert H[:, AGE] == pytest.approx(change(x), abs=1e-7)
+
+
+def test_information_is_taken_out_and_nothing_else() -> None:
+    """By the inverse covariance: the age's entry is less, and what was said of all together is said again."""
+    x, rng = flying(), np.random.default_rng(4)
+    x[CL0] = -0.012
+    root = rng.standard_normal((LAYOUT.size, LAYOUT.size)) * 0.001
+    before = root @ root.T + 1e-6 * np.eye(LAYOUT.size)
+    R = np.diag([1e-4, 1e-4, 4e-4])
+    S, after = R + np.diag([1e-4, 2e-4, 2e-4]), before.copy()
+    y = noise_taken_out(x, after, S, R, 1.0, 0.004**2, P, LAYOUT.offsets)
+    taken = np.linalg.inv(before) - np.linalg.inv(after)
+    scale = abs(np.linalg.inv(before)).max()
+    shown = taken[AGE, AGE]
+    taken[AGE, AGE] = 0.0
+    assert shown > 0.0
+    assert abs(taken).max() < 1e-9 * scale
+    # P'^-1 (x' - x) = j e x: the age's own part of the score.
+    moved = y[CL0] - x[CL0]
+    assert moved == pytest.approx(after[AGE, AGE] * shown * x[CL0], rel=1e-6)
+    W, M = turned(x, P), np.linalg.inv(0.5 * (S + R))
+    assert shown == pytest.approx(2.0 / 3.0 * 0.004**2 * np.trace(W.T @ M @ W), rel=1e-6)
+
+
+@pytest.mark.parametrize("seen_variance", [0.0, 1.0, 10.0])
+def test_noise_of_the_gyro_tells_nothing_of_the_age(seen_variance: float) -> None:
+    """A minute of a still hover with a gyro of 4 mrad/s of noise: no fix shows any age, and what was known of it, to
+    20 ms, stays what is known, however much the samples scatter. Taken as it is, the noise would make the nominal age
+    certain to 10 ms.
+    """
+    x, rng, q = flying(), np.random.default_rng(8), 0.004**2
+    x[V0 : V0 + 3] = 0.0
+    seen, sigma, known = place_seen(x, 0.0), np.array([0.01, 0.01, 0.03]), CONFIG.vision.latency_sigma_s
+    covariance = np.zeros((LAYOUT.size, LAYOUT.size))
+    covariance[AGE, AGE] = known**2
+    own = np.array([1e-4, 0.0, 0.0, 1e-4, 0.0, 9e-4])
+    for _ in range(1800):
+        samples, share = math.sqrt(q) * rng.standard_normal((2, 3)), rng.random()
+        gyro = (1.0 - share) * samples[0] + share * samples[1]
+        r, H, R = np.zeros(3), np.zeros((3, LAYOUT.size)), np.zeros((3, 3))
+        vision(seen + sigma * rng.standard_normal(3), own, x, gyro, P, LAYOUT.offsets, r, H, R)
+        S = H @ covariance @ H.T + R
+        K = covariance @ H.T @ np.linalg.inv(S)
+        x[CL0] += (K @ r)[AGE]
+        covariance = covariance - K @ S @ K.T
+        x = noise_taken_out(x, covariance, S, R, 1.0, seen_variance * q, P, LAYOUT.offsets)
+    sigma_s = math.sqrt(covariance[AGE, AGE])
+    if seen_variance:
+        assert 0.9 * known < sigma_s < 1.0001 * known
+    else:
+        assert sigma_s < 0.55 * known
+    assert abs(x[CL0]) < 2.0 * sigma_s
