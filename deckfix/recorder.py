@@ -168,8 +168,8 @@ class Recorder:
             offset = writer.clock_offsets_ns.get(AUTOPILOT)
             if offset is not None:
                 run = run_of(steps, self.estimator)
-                self._put(writer, estimate_series(run, offset, forecasts([])), "estimates")
-                self._put(writer, self._decided(), "decisions")
+                told = estimate_series(run, offset, forecasts([])) + self._decided()
+                self._put(writer, told, "estimates")
             self._put(writer, self._said(), "texts")
             writer.flush()
             self.written += len(steps)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -102,7 +102,8 @@ class Container:
         self._data_crc = 0
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._chunk_indexes: list[ChunkIndex] = []
+        self._chunk_indexes = bytearray()  # their records: a recording of hours has tens of thousands
+        self._chunk_count = 0
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
@@ -213,19 +214,19 @@ class Container:
             self._emit(struct.pack("<BQHI", 7, 6 + index.nbytes, channel, index.nbytes) + index.tobytes())
         if logs:
             self._span(start, end)
-        self._chunk_indexes.append(
-            ChunkIndex(
-                message_start_time=start,
-                message_end_time=end,
-                chunk_start_offset=chunk_start,
-                chunk_length=index_start - chunk_start,
-                message_index_offsets=offsets,
-                message_index_length=self._position - index_start,
-                compression=compression,
-                compressed_size=len(stored),
-                uncompressed_size=size,
-            )
+        entry = ChunkIndex(
+            message_start_time=start,
+            message_end_time=end,
+            chunk_start_offset=chunk_start,
+            chunk_length=index_start - chunk_start,
+            message_index_offsets=offsets,
+            message_index_length=self._position - index_start,
+            compression=compression,
+            compressed_size=len(stored),
+            uncompressed_size=size,
         )
+        self._chunk_indexes += _record(entry)
+        self._chunk_count += 1
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Write a metadata record."""
@@ -264,34 +265,30 @@ class Container:
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
-            chunk_count=len(self._chunk_indexes),
+            chunk_count=self._chunk_count,
             message_count=self.message_count,
             metadata_count=len(self._metadata_indexes),
             message_start_time=self._start or 0,
             message_end_time=self._end,
             schema_count=len(self._schemas),
         )
-        groups: list[tuple[Opcode, list[McapRecord]]] = [
-            (Opcode.SCHEMA, [*self._schemas.values()]),
-            (Opcode.CHANNEL, [*self._channels.values()]),
-            (Opcode.STATISTICS, [statistics]),
-            (Opcode.CHUNK_INDEX, [*self._chunk_indexes]),
-            (Opcode.ATTACHMENT_INDEX, [*self._attachment_indexes]),
-            (Opcode.METADATA_INDEX, [*self._metadata_indexes]),
+        groups: list[tuple[Opcode, bytes | bytearray]] = [
+            (Opcode.SCHEMA, _records(self._schemas.values())),
+            (Opcode.CHANNEL, _records(self._channels.values())),
+            (Opcode.STATISTICS, _record(statistics)),
+            (Opcode.CHUNK_INDEX, self._chunk_indexes),
+            (Opcode.ATTACHMENT_INDEX, _records(self._attachment_indexes)),
+            (Opcode.METADATA_INDEX, _records(self._metadata_indexes)),
         ]
         start = self._position
-        builder = RecordBuilder()
+        summary = bytearray()
         offsets = []
         for opcode, records in groups:
-            first = builder.count
-            for record in records:
-                record.write(builder)
             if records:
-                offsets.append(SummaryOffset(opcode, start + first, builder.count - first))
-        offset_start = start + builder.count
-        for offset in offsets:
-            offset.write(builder)
-        summary = _bytes_of(builder)
+                offsets.append(SummaryOffset(opcode, start + len(summary), len(records)))
+            summary += records
+        offset_start = start + len(summary)
+        summary += _records(offsets)
         head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
         self._emit(summary)
         self._emit_record(Footer(start, offset_start, zlib.crc32(head, zlib.crc32(summary))))
@@ -310,9 +307,7 @@ class Container:
         self._start = start if self._start is None else min(self._start, start)
 
     def _emit_record(self, record: McapRecord) -> None:
-        builder = RecordBuilder()
-        record.write(builder)
-        self._emit(_bytes_of(builder))
+        self._emit(_record(record))
 
     def _emit(self, data: bytes | bytearray | memoryview) -> None:
         self._stream.write(data)
@@ -320,6 +315,12 @@ class Container:
         self._data_crc = zlib.crc32(data, self._data_crc)
 
 
-def _bytes_of(builder: RecordBuilder) -> bytes:
+def _record(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data
+
+
+def _records(records: Iterable[McapRecord]) -> bytes:
+    return b"".join(_record(record) for record in records)

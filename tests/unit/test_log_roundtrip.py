@@ -296,6 +296,36 @@ def test_images_stream_in_bounded_memory(tmp_path: Path) -> None:
     assert peak < 0.3 * total
 
 
+def test_hours_of_small_chunks_keep_little_memory(tmp_path: Path) -> None:
+    path, count = tmp_path / "f.mcap", 2000
+    with FlightWriter(path) as writer:
+
+        def write(first: int, end: int) -> None:
+            for i in range(first, end):
+                for topic in ("/vision/image_a", "/vision/image_b", "/vision/image_c", "/vision/image_d"):
+                    writer.write_message(
+                        topic, {"format": "jpeg", "data": b"x"}, arrival_ns=UTC + i * 10**7,
+                        message_type="sensor_msgs/msg/CompressedImage",
+                    )  # fmt: skip
+                writer.flush()
+
+        write(0, 100)
+        tracemalloc.start()
+        try:
+            write(100, count)
+            grown, _ = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert grown < 200 * count
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert len(summary.chunk_indexes) == count
+    assert summary.statistics is not None
+    assert summary.statistics.chunk_count == count
+    assert [len(c.message_index_offsets) for c in summary.chunk_indexes] == [4] * count
+
+
 def test_series_of_zero_length_are_passed_over(tmp_path: Path) -> None:
     empty = Series("/imu", np.empty(0, np.int64), np.empty(0, np.int64), new_rows("/imu", 0))
     with FlightWriter(tmp_path / "f.mcap") as writer:
