@@ -14,6 +14,7 @@ from estimation.deck import vision
 from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_exp, quat_multiply, quat_to_matrix
 from estimation.parameters import Site, pack_parameters
 from estimation.state import CAMERA_LATENCY, CL0, P0, PL0, PO0, Q0, V0, Layout, nominal_zero
+from estimation.update import MAX_LATENCY_S, MIN_LATENCY_S, hold_latency
 
 CONFIG = parse_config("[platform]\nuse = true\n[vision]\nlever_arm_m = [0.1, -0.05, 0.2]\n")
 LAYOUT = Layout.of(CONFIG)
@@ -117,3 +118,14 @@ def test_noise_of_the_gyro_tells_nothing_of_the_age(seen_variance: float) -> Non
     else:
         assert sigma_s < 0.55 * known
     assert abs(x[CL0]) < 2.0 * sigma_s
+
+
+@pytest.mark.parametrize("calibrated_s", [0.0, 0.05])
+def test_the_age_stays_in_its_box(calibrated_s: float) -> None:
+    """Below zero as far as the map of the clocks may err; calibrated and learned together."""
+    config = parse_config(f"[platform]\nuse = true\n[vision]\nlatency_s = {calibrated_s}\n")
+    p, x = pack_parameters(config, Site((0.9, 0.1, 50.0), 0.0)), flying()
+    for learned_s, kept_s in ((-1.0, MIN_LATENCY_S), (-0.01 - calibrated_s, -0.01), (1.0, MAX_LATENCY_S)):
+        x[CL0] = learned_s
+        hold_latency(x, p)
+        assert calibrated_s + x[CL0] == pytest.approx(kept_s)
