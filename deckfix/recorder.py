@@ -164,26 +164,31 @@ class Recorder:
             for _ in range(len(self._images)):
                 self._write_image(writer, self._images.popleft())
             # The first message of a clock fixes its constant, which the estimates of that clock need.
-            self._put(writer, self._sensors(steps), "sensors")
+            self._put(writer, sensors=self._sensors(steps))
             offset = writer.clock_offsets_ns.get(AUTOPILOT)
             if offset is not None:
                 run = run_of(steps, self.estimator)
-                told = estimate_series(run, offset, forecasts([])) + self._decided()
-                self._put(writer, told, "estimates")
-            self._put(writer, self._said(), "texts")
+                told = estimate_series(run, offset, forecasts([]))
+                self._put(writer, estimates=told, decisions=self._decided())
+            self._put(writer, texts=self._said())
             writer.flush()
             self.written += len(steps)
         except LogError as error:
             self.failed = str(error)
 
-    def _put(self, writer: FlightWriter, series: list[Series], what: str) -> None:
-        """Write series; those that cannot be stored are counted and left out, a disk's error is passed on."""
+    def _put(self, writer: FlightWriter, **series: list[Series]) -> None:
+        """Write series, in one chunk; what cannot be stored is counted and left out, a disk's error passed on."""
+        named = [(what, one) for what, some in series.items() for one in some]
         try:
-            writer.write_series(*series)
+            writer.write_series(*(one for _, one in named))
         except LogError as error:
             if isinstance(error.__cause__, OSError):
                 raise
-            self.drops[what] += sum(len(s) for s in series)
+            if len(named) == 1:
+                self.drops[named[0][0]] += len(named[0][1])
+                return
+            for what, one in named:
+                self._put(writer, **{what: [one]})
 
     def _sensors(self, steps: list[Step]) -> list[Series]:
         events = [s.event for s in steps if s.event is not None]

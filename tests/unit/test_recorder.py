@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from deckfix.recorder import Recorder, log_path
 from deckfix.replaying import CONFIG_NAME, replay
 from estimation.config import Config, dump_config
 from estimation.events import COMPANION, Imu, VisionFix
+from estimation.modes import Decision, Mode, Reason
 from estimation.output import with_platform
 from logs import open_flight
 from logs.errors import LogError
@@ -154,3 +156,19 @@ def test_what_cannot_be_stored_is_left_out_and_the_rest_is_written(tmp_path: Pat
     assert made.failed == ""
     assert made.drops["texts"] == 1
     assert len(open_flight(tmp_path / "f.mcap").events()) == 1
+
+
+def test_a_decision_that_cannot_be_stored_costs_no_estimate(tmp_path: Path) -> None:
+    """They are written together, but what is wrong with the one is not counted on the other."""
+    made, pipeline = begun(tmp_path / "f.mcap")
+    steps = [pipeline.step(event) for event in small_events(3.0)]
+    nan = np.full(3, np.nan)
+    decision = Decision(Mode.IDLE, Reason.NOT_READY, nan, 0.0, 0.1, nan, math.nan, math.nan)
+    for step in steps:
+        made.step(step)
+    made.decision(steps[-1].event.stamp_ns, -5, decision)  # type: ignore[union-attr]
+    made.close()
+    assert made.failed == ""
+    assert made.drops == {"decisions": 1}
+    estimates = open_flight(tmp_path / "f.mcap").series("/estimate/odometry")
+    assert sum(len(s) for s in estimates) == sum(s.estimate is not None for s in steps) > 0
