@@ -6,7 +6,9 @@ function at the filter's own bound, over the measurements that every replay comp
 sigma is the larger of two: that of the peak's curvature, which is right if the models are, and that of the slopes of
 disjoint parts of the flight, which needs no such trust ("sandwich").
 
-Latency >= 0: the content is older than its stamp, t_content = map(t_stamp) - latency.
+Latency >= 0: the content is older than its stamp, t_content = map(t_stamp) - latency. No content is newer, but what the
+map errs by is found with it: where the exchanges of the clocks take longer one way than the other, up to half their
+round trip. So the filter's own state may be below zero, and so may what is found here; ``BELOW_ZERO`` then says it.
 """
 
 from __future__ import annotations
@@ -52,6 +54,8 @@ DIP = 2.0
 """A second peak counts when the profile falls by this much between the two, and it is within ``RIVAL`` of the first."""
 RIVAL = 8.0
 NEGATIVE_SIGMA = 3.0
+"""A latency that is below zero by more than this many of its sigmas is told to be so."""
+BELOW_ZERO = "below zero: the map of the clocks sets the fixes too early, or their stamps are wrong"
 APART_SIGMA = 4.0
 """Halves of the flight that differ by more than this many of their sigmas contradict each other."""
 
@@ -140,6 +144,10 @@ def latency_profile(
     known = replace(facts or Facts(), vision_by_arrival=False)
     found = profile_of(_Replay(mapped, config, known, engine), jobs)
     found = replace(found, rotation_radps=_rotation(mapped), by_arrival=by_arrival, clocks=clocks)
+    if by_arrival and found.status is LatencyStatus.ESTIMATED and _below_zero(found.latency_s, found.sigma_s):
+        # An arrival is on the clock that the others arrive by: there is no map to err.
+        reason = "fixes cannot be newer than their arrival: the stamps of the inertial samples are wrong"
+        return replace(found, status=LatencyStatus.INCONSISTENT, reason=reason)
     if found.rotation_radps >= config.vision.latency_rate_radps:
         return found
     # What is left then is how the vehicle moves against the raft, and that tells of the raft's sway as well.
@@ -173,7 +181,7 @@ def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:
     status, reason = _judged(peak, sigma, halves, fixes, rival)
     total = values.sum(axis=1)
     return LatencyProfile(
-        latency_s=max(peak, 0.0) if status is LatencyStatus.ESTIMATED else peak,
+        latency_s=peak,
         sigma_s=min(sigma, UNKNOWN_S),
         status=status,
         reason=reason,
@@ -342,12 +350,12 @@ def _judged(
     if not MIN_LATENCY_S < peak < MAX_LATENCY_S:
         span = f"{MIN_LATENCY_S * 1e3:.0f} to {MAX_LATENCY_S * 1e3:.0f} ms"
         return inconsistent, f"the likelihood still rises at the end of what is searched, {span}"
-    if peak < -NEGATIVE_SIGMA * sigma:
-        return (
-            inconsistent,
-            "fixes cannot be newer than their stamps: the clocks' offset, or the stamps, are wrong",
-        )
-    return LatencyStatus.ESTIMATED, "one peak, and the halves of the flight agree"
+    agreed = "one peak, and the halves of the flight agree"
+    return LatencyStatus.ESTIMATED, f"{agreed}; {BELOW_ZERO}" if _below_zero(peak, sigma) else agreed
+
+
+def _below_zero(latency_s: float, sigma_s: float) -> bool:
+    return latency_s < -NEGATIVE_SIGMA * sigma_s
 
 
 def _rotation(batch: EventBatch) -> float:

@@ -75,7 +75,7 @@ def sync_command(
 def with_latency(config: Config, found: LatencyProfile) -> Config:
     """Return the configuration with the latency found, for fixes with stamps of their own or for those without."""
     if found.by_arrival:
-        values = {"arrival_latency_s": found.latency_s, "arrival_latency_sigma_s": found.sigma_s}
+        values = {"arrival_latency_s": max(found.latency_s, 0.0), "arrival_latency_sigma_s": found.sigma_s}
     else:
         values = {"latency_s": found.latency_s, "latency_sigma_s": found.sigma_s}
     rounded = {name: round(value, 6) for name, value in values.items()}

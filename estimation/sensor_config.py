@@ -166,7 +166,12 @@ class VisionConfig(Table, frozen=True):
 
     latency_s: Annotated[
         float,
-        Meta(ge=0.0, le=0.15, description="age of a fix at its stamp, as calibrated", extra={"unit": "s"}),
+        Meta(
+            ge=-0.03,
+            le=0.15,
+            description="age of a fix at its stamp, calibrated; below 0 where the map of the clocks sets it too early",
+            extra={"unit": "s"},
+        ),
     ] = 0.0
     latency_sigma_s: Annotated[
         float, positive("1-sigma of that age; the state that learns it stays within -0.03 to 0.15 s", "s")
