@@ -9,12 +9,11 @@ nothing of white noise. The fixes do not follow the noise, which an update takes
 
 from __future__ import annotations
 
-import numpy as np
-
 from estimation import parameters as par
 from estimation.algebra import inverse
-from estimation.frames import Array, compose, quat_exp, quat_to_matrix, rotate, skew
-from estimation.state import CAMERA_LATENCY, CL0, CM0, P0, PH0, PL0, PO0, PS0, Q0, Offsets, plus
+from estimation.deck import body_to_camera, target_in_body
+from estimation.frames import Array, compose, skew
+from estimation.state import CAMERA_LATENCY, CAMERA_MOUNT, CL0, Offsets, plus
 
 INTERPOLATED = 2.0 / 3.0
 """Variance of white noise interpolated between two samples, over that of a sample, on average over the interval."""
@@ -24,14 +23,7 @@ def turned(x: Array, p: Array) -> Array:
     """Return R_cm [b]x (3, 3) [m]: less this times the angular velocity is a fix's change per second of its age by
     rotation, b being the target in the body.
     """
-    R_bn = quat_to_matrix(x[Q0 : Q0 + 4]).T.copy()
-    R_cb = p[par.VISION_MOUNT : par.VISION_MOUNT + 9].copy().reshape(3, 3)
-    R_cm = compose(R_cb, quat_to_matrix(quat_exp(x[CM0 : CM0 + 3])).T.copy())
-    d = np.empty(3)
-    d[0] = x[PO0] + x[PS0 + 5] - x[P0]
-    d[1] = x[PO0 + 1] + x[PS0 + 11] - x[P0 + 1]
-    d[2] = -x[PL0] - x[PH0 + 5] - x[P0 + 2]
-    return compose(R_cm, skew(rotate(R_bn, d)))
+    return compose(body_to_camera(x, p), skew(target_in_body(x)))
 
 
 def noise_taken_out(
@@ -45,7 +37,8 @@ def noise_taken_out(
     information on the age, of the value zero. M^-1 is the variance of the fix about what all the others tell: R, and
     half of what is unknown before it, S - R, as fixes follow as well. Without that information (the corrected score;
     Nakamura, 1990): P' = (P^-1 - j e e')^-1, x' = x + P' e j e'x. No more is taken than was learned since the first
-    fix: vibration that is no white noise may scatter more than it shows.
+    fix: vibration that is no white noise may scatter more than it shows. The camera's mounting, which the update only
+    considered, has not moved then and does not now: a gain of zero there undoes one of zero.
     """
     M = inverse(0.5 * (S - R) + R / weight, 3)
     W = turned(x, p)
@@ -59,7 +52,12 @@ def noise_taken_out(
     most = 1.0 / column[age] - 1.0 / p[par.LATENCY_SIGMA] ** 2
     shown = min(INTERPOLATED * variance * trace, max(0.0, most))
     share = shown / (1.0 - shown * column[age])
+    mount = offsets[CAMERA_MOUNT]
+    held = P[mount : mount + 3, mount : mount + 3].copy()
     for a in range(P.shape[0]):
         for b in range(P.shape[0]):
             P[a, b] += share * column[a] * column[b]
-    return plus(x, share * x[CL0] * column, offsets)
+    P[mount : mount + 3, mount : mount + 3] = held
+    error = share * x[CL0] * column
+    error[mount : mount + 3] = 0.0
+    return plus(x, error, offsets)

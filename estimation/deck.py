@@ -196,19 +196,13 @@ def vision(
     """
     if offsets[PLATFORM_OFFSET] < 0:
         return -9
-    R_nb = quat_to_matrix(x[Q0 : Q0 + 4])
-    R_bn = R_nb.T.copy()
     R_cb = p[par.VISION_MOUNT : par.VISION_MOUNT + 9].copy().reshape(3, 3)
-    R_cm = compose(R_cb, quat_to_matrix(quat_exp(x[CM0 : CM0 + 3])).T.copy())
-    d = np.empty(3)
-    d[0] = x[PO0] + x[PS0 + 5] - x[P0]
-    d[1] = x[PO0 + 1] + x[PS0 + 11] - x[P0 + 1]
-    d[2] = -x[PL0] - x[PH0 + 5] - x[P0 + 2]
-    b = rotate(R_bn, d)
+    R_cm = body_to_camera(x, p)
+    b = target_in_body(x)
     seen = b - p[par.VISION_LEVER : par.VISION_LEVER + 3]
     c = rotate(R_cm, seen)
     scale = 1.0 + x[RS0]
-    D = compose(R_cm, R_bn)
+    D = compose(R_cm, quat_to_matrix(x[Q0 : Q0 + 4]).T.copy())
     T = compose(R_cm, skew(b))
     M = compose(R_cb, skew(seen))
     aging = rotate(D, x[V0 : V0 + 3]) - rotate(T, gyro)
@@ -241,11 +235,24 @@ def vision(
     return 3
 
 
+def body_to_camera(x: Array, p: Array) -> Array:
+    """Return the rotation R_cm (3, 3) of the body to the camera with its mounting as estimated."""
+    R_cb = p[par.VISION_MOUNT : par.VISION_MOUNT + 9].copy().reshape(3, 3)
+    return compose(R_cb, quat_to_matrix(quat_exp(x[CM0 : CM0 + 3])).T.copy())
+
+
+def target_in_body(x: Array) -> Array:
+    """Return the platform's place relative to the IMU (3,) [m], in the body."""
+    d = np.empty(3)
+    d[0] = x[PO0] + x[PS0 + 5] - x[P0]
+    d[1] = x[PO0 + 1] + x[PS0 + 11] - x[P0 + 1]
+    d[2] = -x[PL0] - x[PH0 + 5] - x[P0 + 2]
+    return rotate(quat_to_matrix(x[Q0 : Q0 + 4]).T.copy(), d)
+
+
 def camera_to_ned(x: Array, p: Array) -> Array:
     """Return the rotation (3, 3) of the camera, with its mounting as estimated, to NED."""
-    R_cb = p[par.VISION_MOUNT : par.VISION_MOUNT + 9].copy().reshape(3, 3)
-    R_cm = compose(R_cb, quat_to_matrix(quat_exp(x[CM0 : CM0 + 3])).T.copy())
-    return compose(quat_to_matrix(x[Q0 : Q0 + 4]), R_cm.T.copy())
+    return compose(quat_to_matrix(x[Q0 : Q0 + 4]), body_to_camera(x, p).T.copy())
 
 
 def seen_place(r: Array, R: Array, x: Array, p: Array, seen: Array) -> None:

@@ -97,7 +97,11 @@ def _put(target: Array, row: int, column: int, scale: float, block: Array) -> Ca
     return assign
 
 
-for _module in (algebra, band, camera_age, deck, frames, models, relinearise, state, update, watch):
+_COMPILED = (algebra, band, camera_age, deck, frames, models, relinearise, state, update, watch)
+_READ = (parameters, rows, trail)
+"""Modules whose functions are compiled, and those of which compiled code takes names alone."""
+
+for _module in _COMPILED:
     for _function in vars(_module).values():
         if (
             inspect.isfunction(_function)
@@ -115,20 +119,5 @@ for _module in (algebra, band, camera_age, deck, frames, models, relinearise, st
         ):
             register_jitable(_function)
 
-_MODULES = (
-    algebra,
-    band,
-    camera_age,
-    deck,
-    frames,
-    models,
-    parameters,
-    relinearise,
-    rows,
-    state,
-    trail,
-    update,
-    watch,
-)
-SOURCES = (*(Path(inspect.getfile(module)) for module in _MODULES), Path(__file__))
+SOURCES = (*(Path(inspect.getfile(module)) for module in (*_COMPILED, *_READ)), Path(__file__))
 """The files that compiled code is made from: code compiled of other contents is never used."""

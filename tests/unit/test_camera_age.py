@@ -13,7 +13,20 @@ from estimation.config import parse_config
 from estimation.deck import vision
 from estimation.frames import R_CB_NOMINAL, euler_to_quat, quat_exp, quat_multiply, quat_to_matrix
 from estimation.parameters import Site, pack_parameters
-from estimation.state import CAMERA_LATENCY, CL0, P0, PL0, PO0, Q0, V0, Layout, nominal_zero
+from estimation.state import (
+    CAMERA_LATENCY,
+    CAMERA_MOUNT,
+    CL0,
+    CM0,
+    P0,
+    PL0,
+    PO0,
+    Q0,
+    V0,
+    Layout,
+    nominal_zero,
+    plus,
+)
 from estimation.update import MAX_LATENCY_S, MIN_LATENCY_S, hold_latency
 
 CONFIG = parse_config("[platform]\nuse = true\n[vision]\nlever_arm_m = [0.1, -0.05, 0.2]\n")
@@ -69,7 +82,7 @@ def test_the_innovation_of_an_aged_fix_is_of_second_order(age_s: float) -> None:
 
 
 def test_information_is_taken_out_and_nothing_else() -> None:
-    """By the inverse covariance: the age's entry is less, and what was said of all together is said again."""
+    """An update by an age of zero with that information, which considers the camera's mounting, undoes it."""
     x, rng = flying(), np.random.default_rng(4)
     x[CL0] = -0.012
     root = rng.standard_normal((LAYOUT.size, LAYOUT.size)) * 0.001
@@ -77,17 +90,19 @@ def test_information_is_taken_out_and_nothing_else() -> None:
     R = np.diag([1e-4, 1e-4, 4e-4])
     S, after = R + np.diag([1e-4, 2e-4, 2e-4]), before.copy()
     y = noise_taken_out(x, after, S, R, 1.0, 0.004**2, P, LAYOUT.offsets)
-    taken = np.linalg.inv(before) - np.linalg.inv(after)
-    scale = abs(np.linalg.inv(before)).max()
-    shown = taken[AGE, AGE]
-    taken[AGE, AGE] = 0.0
-    assert shown > 0.0
-    assert abs(taken).max() < 1e-9 * scale
-    # P'^-1 (x' - x) = j e x: the age's own part of the score.
-    moved = y[CL0] - x[CL0]
-    assert moved == pytest.approx(after[AGE, AGE] * shown * x[CL0], rel=1e-6)
     W, M = turned(x, P), np.linalg.inv(0.5 * (S + R))
-    assert shown == pytest.approx(2.0 / 3.0 * 0.004**2 * np.trace(W.T @ M @ W), rel=1e-6)
+    shown = 2.0 / 3.0 * 0.004**2 * np.trace(W.T @ M @ W)
+    mount = slice(LAYOUT.offsets[CAMERA_MOUNT], LAYOUT.offsets[CAMERA_MOUNT] + 3)
+    assert after[AGE, AGE] > (1.0 + 1e-4) * before[AGE, AGE]
+    assert np.array_equal(after[mount, mount], before[mount, mount])
+    assert np.array_equal(y[CM0 : CM0 + 3], x[CM0 : CM0 + 3])
+    K, H = after[:, AGE] / (after[AGE, AGE] + 1.0 / shown), np.eye(LAYOUT.size)[AGE]
+    K[mount] = 0.0
+    A = np.eye(LAYOUT.size) - np.outer(K, H)
+    undone = A @ after @ A.T + np.outer(K, K) / shown
+    assert abs(undone - before).max() < 1e-12 * abs(before).max()
+    z = plus(y, -K * y[CL0], LAYOUT.offsets)
+    assert z == pytest.approx(x, abs=1e-12)
 
 
 @pytest.mark.parametrize("seen_variance", [0.0, 1.0, 10.0])
