@@ -1,7 +1,8 @@
 """Is the camera's latency found, and is its sigma honest? Simulated hovers over a raft that sways by 10 cm.
 
-Calm air and gusts for 60 s of sight; circling, and rocking to and fro, by 6 deg for 20 s and for 60 s. In each flight
-the true latency is drawn from the prior that the filter is told (50 ms, 1-sigma 15 ms) and wanders as it is told.
+Calm air, gusts, and gusts with a gyro that scatters by 28 mrad/s, for 60 s of sight; circling, and rocking to and fro,
+by 6 deg for 20 s and for 60 s. In each flight the true latency is drawn from the prior that the filter is told (50 ms,
+1-sigma 15 ms) and wanders as it is told.
 Online is the filter's own state at the last fix; offline is ``deckfix sync``, against the mean latency over the fixes.
 NEES is the squared error over the stated variance, averaged: 1 is honest. The bound is the least rms error that is
 possible at all (``latency_bound.py``). The clock layer's target is in ``clock.py``.
@@ -33,7 +34,7 @@ from estimation.events import COMPANION, Kind
 from estimation.state import CAMERA_LATENCY, NOMINAL
 from simulation.flight import load_scenario, simulate
 
-SCENARIOS = ("calm", "windy", "excited", "excited_60s", "rocked", "rocked_60s")
+SCENARIOS = ("calm", "windy", "shaken", "excited", "excited_60s", "rocked", "rocked_60s")
 ONLINE_MS = {"windy": 2.0, "excited": 0.5, "rocked": 0.5}
 OFFLINE_MS = {"excited_60s": 0.3, "rocked_60s": 0.3}
 CALM_MS = 10.0

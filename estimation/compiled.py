@@ -25,7 +25,7 @@ from estimation.algebra import (
     reset_attitude,
 )
 from estimation.band import BAND_SIZE
-from estimation.camera_age import noise_taken_out
+from estimation.camera_age import noise_taken_out, noise_told, tells_age, weigh
 from estimation.codecache import jitted
 from estimation.deck import HEAVE, deck_output, no_steps, seen_place, take_up
 from estimation.frames import Array
@@ -59,6 +59,7 @@ from estimation.rows import (
 )
 from estimation.state import (
     ATTITUDE,
+    CAMERA_LATENCY,
     P0,
     PL0,
     PLATFORM_DRIFT,
@@ -79,7 +80,6 @@ from estimation.update import (
     extra_noise,
     hold_latency,
     interpolate,
-    learned_age,
     locked_out,
     reading_noise,
     reset_datum,
@@ -198,7 +198,8 @@ def _propagate(
 
 def _fuse(
     x: Array, P: Array, memory: Array, scatter: Array, kind: int, value: Array, own: Array, gyro: Array,
-    t_s: float, late: int, p: Array, offsets: Offsets, motion: Array, moved: Array, H: Array, result: Array,
+    interval_s: float, t_s: float, late: int, p: Array, offsets: Offsets, motion: Array, moved: Array, H: Array,
+    result: Array,
 ) -> tuple[int, int, Array]:  # fmt: skip
     r = np.zeros(3)
     R = np.zeros((3, 3))
@@ -243,7 +244,13 @@ def _fuse(
         inverted = inverse(innovation_covariance(H, PHt, R, 1.0 / w, m), m)
     K = gain(PHt, inverted, m)
     error = corrected(K, r, m)
-    first, stop = considered(kind, scatter, p, offsets)
+    learn, shown = False, 0.0
+    if kind == VISION:
+        age = offsets[CAMERA_LATENCY]
+        shown = noise_told(x, S, R, w, scatter[1], p)
+        weigh(scatter, shown, PHt[age], inverted, P[age, age])
+        learn = tells_age(scatter, p)
+    first, stop = considered(learn, offsets)
     held = P[first:stop, first:stop].copy()
     error[first:stop] = 0.0
     if moved_far(kind, error, offsets):
@@ -262,8 +269,8 @@ def _fuse(
         for i in range(first, stop):
             for j in range(first, stop):
                 P[i, j] = held[i - first, j - first]
-        if kind == VISION and learned_age(first, offsets):
-            x = noise_taken_out(x, P, S, R, w, scatter[1], p, offsets)
+        if learn:
+            x = noise_taken_out(x, P, shown, interval_s, p, offsets)
         hold_latency(x, p)
     return outcome, mark, x
 
@@ -335,7 +342,8 @@ def _advance(
             held = state[P0 : V0 + 3].copy()
             ints[i, OUTCOME], ints[i, RESET], state = _fuse(
                 state, P, memory[ints[i, SENSOR]], scatter, ints[i, KIND], floats[i, VALUE:OWN],
-                floats[i, OWN:RESULT], gyro, t_s, ints[i, LATE], p, offsets, motion, moved, H, floats[i, RESULT:],
+                floats[i, OWN:RESULT], gyro, (t_imu - clock[1]) * 1e-9, t_s, ints[i, LATE], p, offsets, motion, moved,
+                H, floats[i, RESULT:],
             )  # fmt: skip
             moved[:3] += state[P0 : P0 + 3] - held[:3]
             moved[3:] += (state[V0 : V0 + 3] - held[3:]) ** 2

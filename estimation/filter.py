@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimation import models, update
-from estimation.camera_age import noise_taken_out
+from estimation.algebra import inverse
+from estimation.camera_age import noise_taken_out, noise_told, tells_age, weigh
 from estimation.deck import HEAVE, deck_output, no_steps, seen_place, take_up
 from estimation.frames import Array
 from estimation.outcome import Outcome
@@ -31,7 +32,7 @@ from estimation.rows import (
     FilterState,
     Rows,
 )
-from estimation.state import ATTITUDE, P0, PL0, PO0, V0, Layout, plus
+from estimation.state import ATTITUDE, CAMERA_LATENCY, P0, PL0, PO0, V0, Layout, plus
 from estimation.trail import EMITS, RESET_KIND, RESET_SIZE, Trail
 from estimation.watch import LET_GO, let_go, unexplained
 
@@ -105,7 +106,7 @@ class FilterPyEngine:
             if i < following:
                 gyro = update.interpolate(s.imu, int(s.clock[1]), imu, t_imu, t)[:3]
                 x, P, held = s.x, s.P, s.x[P0 : V0 + 3].copy()
-                self._fuse(rows, i, gyro)
+                self._fuse(rows, i, gyro, (t_imu - int(s.clock[1])) * 1e-9)
                 s.moved[:3] += s.x[P0 : P0 + 3] - held[:3]
                 s.moved[3:] += (s.x[V0 : V0 + 3] - held[3:]) ** 2
                 if self.trail.on:
@@ -151,7 +152,7 @@ class FilterPyEngine:
                 self.trail.chain[k] = F @ self.trail.chain[k]
         s.clock[0] = t
 
-    def _fuse(self, rows: Rows, i: int, gyro: Array) -> None:
+    def _fuse(self, rows: Rows, i: int, gyro: Array, interval_s: float) -> None:
         s, n, kind = self.state, self.layout.size, int(rows.kind[i])
         r, H, R = np.zeros(3), np.zeros((3, n)), np.zeros((3, 3))
         if kind == USER:
@@ -202,7 +203,13 @@ class FilterPyEngine:
         rows.outcome[i] = Outcome.FUSED_LATE if rows.late[i] else Outcome.FUSED
         if w < 1.0:
             rows.outcome[i] = Outcome.DOWNWEIGHTED
-        first, stop = update.considered(kind, s.scatter, self.p, self.layout.offsets)
+        learn, shown = False, 0.0
+        if kind == models.VISION:
+            age = int(self.layout.offsets[CAMERA_LATENCY])
+            shown = noise_told(s.x, S, R, w, s.scatter[1], self.p)
+            weigh(s.scatter, shown, H @ s.P[:, age], inverse(S - R + R / w, m), float(s.P[age, age]))
+            learn = tells_age(s.scatter, self.p)
+        first, stop = update.considered(learn, self.layout.offsets)
         held = s.P[first:stop, first:stop].copy()
         ekf, error = self.ekf, self._update(r, H, R / w)
         error[first:stop] = 0.0
@@ -220,8 +227,8 @@ class FilterPyEngine:
         P[:, att : att + 3] = P[:, att : att + 3] @ G.T
         P[first:stop, first:stop] = held
         s.P = 0.5 * (P + P.T)
-        if kind == models.VISION and update.learned_age(first, self.layout.offsets):
-            s.x = noise_taken_out(s.x, s.P, S, R, w, s.scatter[1], self.p, self.layout.offsets)
+        if learn:
+            s.x = noise_taken_out(s.x, s.P, shown, interval_s, self.p, self.layout.offsets)
         if stop:
             update.hold_latency(s.x, self.p)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimation.band import BAND_PARAMETERS, band_stationary
+from estimation.camera_age import SCATTER_SIZE
 from estimation.config import Config
 from estimation.deck import CHAINS, MOTION_SIZE, places, prior_motion
 from estimation.frames import Array, geodetic_to_ned, quat_to_matrix
@@ -151,7 +152,7 @@ def first_state(start: Start, site: Site, config: Config, layout: Layout, sensor
     motion = _put_platform(P, c, layout) if o[PLATFORM_OFFSET] >= 0 else np.zeros(MOTION_SIZE)
     memory = np.zeros((sensors, MEMORY_SIZE))
     clock = np.array([start.t_ns] * 3, dtype=np.int64)
-    return FilterState(clock, x, P, start.imu, np.zeros(4), memory, motion, np.zeros(6))
+    return FilterState(clock, x, P, start.imu, np.zeros(SCATTER_SIZE), memory, motion, np.zeros(6))
 
 
 def _put(P: Array, start: int, covariance: Array) -> None:

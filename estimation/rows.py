@@ -213,11 +213,11 @@ class Estimates:
 class FilterState:
     """Everything that the next step depends on; copied, it is a checkpoint.
 
-    ``clock`` holds the state's time, the last inertial sample's and the start's [ns]; ``imu`` that sample;
-    ``scatter`` the vibration measure (2), the mean squared rotation and when a learned heave was last let go [s since
-    the start]; ``memory`` what is remembered of each sensor; ``motion`` the parameters of the deck's motion
-    (``estimation.deck``), ``moved`` (6,) how far measurements have moved the vehicle, NED [m], and the summed
-    squares of what they have changed its velocity by [m^2/s^2].
+    ``clock`` holds the state's time, the last inertial sample's and the start's [ns]; ``imu`` that sample; ``scatter``
+    the vibration measure (2), the mean squared rotation, when a learned heave was last let go [s since the start] and
+    what fixes seem to tell of the camera's age (2, ``estimation.camera_age``); ``memory`` what is remembered of each
+    sensor; ``motion`` the parameters of the deck's motion (``estimation.deck``), ``moved`` (6,) how far measurements
+    have moved the vehicle, NED [m], and the summed squares of what they have changed its velocity by [m^2/s^2].
     """
 
     clock: Int

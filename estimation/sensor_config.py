@@ -192,7 +192,8 @@ class VisionConfig(Table, frozen=True):
     latency_rate_radps: Annotated[
         float,
         positive(
-            "rotation (rms over 5 s) below which the age is not learned, only its doubt carried", "rad/s"
+            "rotation (rms over 5 s, less noise) below which the age is not learned, only its doubt carried",
+            "rad/s",
         ),
     ] = 0.035
     angle_sigma_rad: Annotated[

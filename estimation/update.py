@@ -124,21 +124,15 @@ def weight(nis: float, dimension: int, p: Array) -> float:
     return 1.0 if nis <= bound else math.sqrt(bound / nis)
 
 
-def considered(kind: int, scatter: Array, p: Array, offsets: Offsets) -> tuple[int, int]:
+def considered(learn: bool, offsets: Offsets) -> tuple[int, int]:
     """Return the first and last-but-one place of the states that a measurement may not move (Schmidt's filter).
 
-    The camera's mounting always, and its age but for vision under enough rotation. They lie side by side.
+    The camera's mounting always, and its age but for fixes that tell it (``learn``). They lie side by side.
     """
     if offsets[CAMERA_MOUNT] < 0:
         return 0, 0
-    learn = kind == VISION and scatter[2] >= p[par.LATENCY_RATE] ** 2
     start = offsets[CAMERA_MOUNT] if learn else offsets[CAMERA_LATENCY]
     return start, offsets[CAMERA_MOUNT] + 3
-
-
-def learned_age(first: int, offsets: Offsets) -> bool:
-    """Tell from the first of the states that are only considered whether a fix moves the camera's age."""
-    return bool(first > offsets[CAMERA_LATENCY])
 
 
 def hold_latency(x: Array, p: Array) -> None:

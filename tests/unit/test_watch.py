@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from small_flight import BOOT, UTC, small_events
 
 from estimation.band import band_derivatives, band_stationary
+from estimation.camera_age import SCATTER_SIZE
 from estimation.config import parse_config
 from estimation.deck import HEAVE, MOTION_SIZE, prior_motion
 from estimation.estimator import EngineName, LandingEstimator
@@ -87,7 +88,7 @@ def test_letting_go_keeps_the_motion_and_opens_its_doubt() -> None:
     x = nominal_zero()
     x[PH0 : PH0 + 6] = rng.normal(size=6) * 0.1
     moved = band_derivatives(x[PH0 : PH0 + 6], before[:7])
-    memory, scatter = np.full(MEMORY_SIZE, 0.5), np.zeros(4)
+    memory, scatter = np.full(MEMORY_SIZE, 0.5), np.zeros(SCATTER_SIZE)
     old = covariance.copy()
     let_go(12.0, x, covariance, memory, scatter, heave, P, LAYOUT.offsets, np.empty((0, 0)))
     assert np.array_equal(heave[:7], P[PRIOR_HEAVE : PRIOR_HEAVE + 7]) and len(heave) == MOTION_SIZE
