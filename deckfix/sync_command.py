@@ -50,10 +50,11 @@ def sync_command(
     settings, source = configuration(flight, config)
     known = facts(flight)
     by_arrival = arrivals or known.vision_by_arrival
+    events = flight.events()
     with working(f"replaying {Path(file).name} with many latencies"):
         try:
             found = latency_profile(
-                flight.events(), settings, known, cast("EngineName", engine), by_arrival=by_arrival, jobs=jobs
+                events, settings, known, cast("EngineName", engine), by_arrival=by_arrival, jobs=jobs
             )
         except ValueError as error:
             raise InputError(f"{file}: {error}") from None

@@ -67,16 +67,16 @@ class FileBytes:
     def __init__(self, path: Path) -> None:
         try:
             with path.open("rb") as stream:
-                size = stream.seek(0, 2)
-                if size == 0:
-                    raise LogError(path, "the file is empty", "record or import it again")
-                self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+                self.size = stream.seek(0, 2)
+                if self.size:
+                    self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         except FileNotFoundError:
             raise LogError(path, "no such file", "check the name") from None
         except (OSError, ValueError) as error:
             raise LogError(path, f"cannot be read ({error})", "check that it is a readable file") from None
+        if not self.size:
+            raise LogError(path, "the file is empty", "record or import it again")
         self.view = memoryview(self._map)
-        self.size = size
 
     def find(self, pattern: bytes, start: int) -> int:
         """Return the first place of a pattern, -1 if there is none."""

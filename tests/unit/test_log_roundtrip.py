@@ -157,6 +157,19 @@ def test_nothing_is_overwritten_without_force(path: Path) -> None:
     assert open_flight(path).channels == []
 
 
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [(None, "no such file; check the name"), (b"", "the file is empty; record or import it again")],
+)
+def test_a_file_that_holds_nothing_is_told_in_one_line(tmp_path: Path, data: bytes | None, said: str) -> None:
+    path = tmp_path / "f.mcap"
+    if data is not None:
+        path.write_bytes(data)
+    with pytest.raises(LogError) as caught:
+        open_flight(path)
+    assert str(caught.value) == f"{path}: {said}"
+
+
 def test_a_missing_folder_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be created") as caught:
         FlightWriter(tmp_path / "no" / "f.mcap")
