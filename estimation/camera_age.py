@@ -12,6 +12,8 @@ Plain functions of arrays that numba compiles as they stand.
 
 from __future__ import annotations
 
+import numpy as np
+
 from estimation import parameters as par
 from estimation.algebra import inverse
 from estimation.deck import body_to_camera, target_in_body
@@ -97,9 +99,7 @@ def noise_taken_out(x: Array, P: Array, shown: float, interval_s: float, p: Arra
     share = taken / (1.0 - taken * column[age])
     mount = offsets[CAMERA_MOUNT]
     held = P[mount : mount + 3, mount : mount + 3].copy()
-    for a in range(P.shape[0]):
-        for b in range(P.shape[0]):
-            P[a, b] += share * column[a] * column[b]
+    P += np.outer(share * column, column)
     P[mount : mount + 3, mount : mount + 3] = held
     followed = INTEGRATED / INTERPOLATED * min(interval_s, LONG_STEP_S)
     error = share * (x[CL0] - followed) * column

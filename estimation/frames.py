@@ -53,11 +53,13 @@ def rotate(m: Array, v: Array) -> Array:
 
 def quat_multiply(a: Array, b: Array) -> Array:
     """Return the Hamilton product a * b of two quaternions (w, x, y, z)."""
+    aw, ax, ay, az = a[0], a[1], a[2], a[3]
+    bw, bx, by, bz = b[0], b[1], b[2], b[3]
     q = np.empty(4)
-    q[0] = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3]
-    q[1] = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
-    q[2] = a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1]
-    q[3] = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]
+    q[0] = aw * bw - ax * bx - ay * by - az * bz
+    q[1] = aw * bx + ax * bw + ay * bz - az * by
+    q[2] = aw * by - ax * bz + ay * bw + az * bx
+    q[3] = aw * bz + ax * by - ay * bx + az * bw
     return q
 
 

@@ -54,7 +54,8 @@ UNUSABLE_NOW = -9
 
 def right_jacobian(v: Array) -> Array:
     """Return J_r(v) with ``exp(v + d) = exp(v) exp(J_r(v) d)`` to first order; shape (3, 3) (Sola, 2017, eq. 183)."""
-    angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    x, y, z = v[0], v[1], v[2]
+    angle2 = x * x + y * y + z * z
     if angle2 < 1e-6:
         a = 0.5 - angle2 / 24.0
         b = 1.0 / 6.0 - angle2 / 120.0
@@ -62,12 +63,12 @@ def right_jacobian(v: Array) -> Array:
         angle = math.sqrt(angle2)
         a = (1.0 - math.cos(angle)) / angle2
         b = (angle - math.sin(angle)) / (angle2 * angle)
-    J = skew(v)
-    # [v]x squared is v v' - |v|^2 I.
-    for i in range(3):
-        for j in range(3):
-            J[i, j] = b * v[i] * v[j] - a * J[i, j]
-        J[i, i] += 1.0 - b * angle2
+    # I - a [v]x + b [v]x^2, and [v]x squared is v v' - |v|^2 I.
+    rest = 1.0 - b * angle2
+    J = np.empty((3, 3))
+    J[0, 0], J[0, 1], J[0, 2] = b * x * x + rest, b * x * y + a * z, b * x * z - a * y
+    J[1, 0], J[1, 1], J[1, 2] = b * y * x - a * z, b * y * y + rest, b * y * z + a * x
+    J[2, 0], J[2, 1], J[2, 2] = b * z * x + a * y, b * z * y - a * x, b * z * z + rest
     return J
 
 
@@ -115,7 +116,6 @@ def transition(
     the new nominal state. Strapdown in the local tangent plane; the Earth's rate is left to the gyro bias
     (docs/limits.md).
     """
-    n = F.shape[0]
     pos, vel, att = offsets[POSITION], offsets[VELOCITY], offsets[ATTITUDE]
     bg, ba = offsets[GYRO_BIAS], offsets[ACCEL_BIAS]
     w = gyro - x[BG0 : BG0 + 3]
@@ -135,8 +135,7 @@ def transition(
 
     F[:, :] = 0.0
     Q[:, :] = 0.0
-    for i in range(n):
-        F[i, i] = 1.0
+    np.fill_diagonal(F, 1.0)
     A = compose(R_mid, skew(f))
     tilted = compose(A, R_half.T.copy())
     turned = compose(A, right_jacobian(0.5 * dt * w))
@@ -150,15 +149,17 @@ def transition(
     put(F, att, bg, -dt, right_jacobian(dt * w))
     qa = p[par.ACCEL_NOISE] ** 2 + scatter[0]
     qg = p[par.GYRO_NOISE] ** 2 + scatter[1]
+    place, both, speed, turn = qa * dt**3 / 3.0, qa * dt**2 / 2.0, qa * dt, qg * dt
+    walk_g, walk_a = p[par.GYRO_BIAS_WALK] ** 2 * dt, p[par.ACCEL_BIAS_WALK] ** 2 * dt
     for i in range(3):
         F[pos + i, vel + i] = dt
-        Q[pos + i, pos + i] = qa * dt**3 / 3.0
-        Q[pos + i, vel + i] = qa * dt**2 / 2.0
-        Q[vel + i, pos + i] = qa * dt**2 / 2.0
-        Q[vel + i, vel + i] = qa * dt
-        Q[att + i, att + i] = qg * dt
-        Q[bg + i, bg + i] = p[par.GYRO_BIAS_WALK] ** 2 * dt
-        Q[ba + i, ba + i] = p[par.ACCEL_BIAS_WALK] ** 2 * dt
+        Q[pos + i, pos + i] = place
+        Q[pos + i, vel + i] = both
+        Q[vel + i, pos + i] = both
+        Q[vel + i, vel + i] = speed
+        Q[att + i, att + i] = turn
+        Q[bg + i, bg + i] = walk_g
+        Q[ba + i, ba + i] = walk_a
     if offsets[GPS_BIAS] >= 0:
         # First-order Gauss-Markov, exact for any dt; that of the height has no mean to come back to: how it wanders
         # says nothing of how far it is off.
