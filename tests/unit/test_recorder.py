@@ -166,7 +166,9 @@ def test_a_decision_that_cannot_be_stored_costs_no_estimate(tmp_path: Path) -> N
     decision = Decision(Mode.IDLE, Reason.NOT_READY, nan, 0.0, 0.1, nan, math.nan, math.nan)
     for step in steps:
         made.step(step)
-    made.decision(steps[-1].event.stamp_ns, -5, decision)  # type: ignore[union-attr]
+    last = steps[-1].event
+    assert last is not None
+    made.decision(last.stamp_ns, -5, decision)
     made.close()
     assert made.failed == ""
     assert made.drops == {"decisions": 1}

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from small_flight import deck_recording
 
+from deckfix import sync
 from deckfix.cli import main
 from deckfix.replaying import facts
 from deckfix.sync import KEY_DTYPE, LatencyStatus, Replay, latency_profile, profile_of
-from deckfix.sync_command import digest
+from deckfix.sync_command import digest, with_latency
 from estimation.clock import SyncStatus
 from estimation.clockbank import ClockSummary
 from estimation.config import load_config, parse_config
@@ -158,6 +159,31 @@ def test_the_latency_is_found_where_the_vehicle_rocks(flight: SimulatedFlight, t
     assert np.degrees(found.rotation_radps) > 15.0
     assert [c.clock for c in found.clocks] == [COMPANION]
     assert found.clocks[0].skew_ppm == pytest.approx(30.0, abs=4.0 * found.clocks[0].skew_sigma_ppm + 1.0)
+
+
+@pytest.mark.parametrize(
+    ("by_arrival", "found_s", "status", "written_s"),
+    [
+        (False, -0.02, LatencyStatus.ESTIMATED, -0.02),
+        (True, -0.02, LatencyStatus.INCONSISTENT, 0.0),
+        (True, -0.0005, LatencyStatus.ESTIMATED, 0.0),
+    ],
+)
+def test_no_fix_is_newer_than_its_arrival(
+    flight: SimulatedFlight, monkeypatch: pytest.MonkeyPatch,
+    by_arrival: bool, found_s: float, status: LatencyStatus, written_s: float,
+) -> None:  # fmt: skip
+    """A map between clocks can err, so that a latency by the fixes' own stamps may be below zero; an arrival cannot."""
+    shown = profile_of(parabolas(np.array([found_s]), 5e-4), jobs=1)
+    monkeypatch.setattr(sync, "profile_of", lambda replay, jobs: shown)
+    config = flight.scenario.config
+    found = latency_profile(flight.batch, config, flight.facts, by_arrival=by_arrival)
+    assert found.status is status, found.reason
+    assert ("their arrival" in found.reason) == (status is LatencyStatus.INCONSISTENT)
+    vision = with_latency(config, found).vision
+    assert (vision.arrival_latency_s if by_arrival else vision.latency_s) == pytest.approx(
+        written_s, abs=1e-6
+    )
 
 
 def test_no_fixes_are_refused(flight: SimulatedFlight) -> None:
