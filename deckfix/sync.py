@@ -144,14 +144,14 @@ def latency_profile(
     known = replace(facts or Facts(), vision_by_arrival=False)
     found = profile_of(_Replay(mapped, config, known, engine), jobs)
     found = replace(found, rotation_radps=_rotation(mapped), by_arrival=by_arrival, clocks=clocks)
+    if found.rotation_radps < config.vision.latency_rate_radps:
+        # What is left then is how the vehicle moves against the raft, and that tells of the raft's sway as well.
+        return replace(found, status=LatencyStatus.UNOBSERVABLE, reason=HARDLY_TURNED, sigma_s=UNKNOWN_S)
     if by_arrival and found.status is LatencyStatus.ESTIMATED and _below_zero(found.latency_s, found.sigma_s):
         # An arrival is on the clock that the others arrive by: there is no map to err.
         reason = "fixes cannot be newer than their arrival: the stamps of the inertial samples are wrong"
         return replace(found, status=LatencyStatus.INCONSISTENT, reason=reason)
-    if found.rotation_radps >= config.vision.latency_rate_radps:
-        return found
-    # What is left then is how the vehicle moves against the raft, and that tells of the raft's sway as well.
-    return replace(found, status=LatencyStatus.UNOBSERVABLE, reason=HARDLY_TURNED, sigma_s=UNKNOWN_S)
+    return found
 
 
 def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:

@@ -150,9 +150,8 @@ class Layout:
         out = np.empty(len(columns), dtype=self.dtype)
         out.view(np.uint8).reshape(len(columns), -1)[:] = np.frombuffer(self.template, dtype=np.uint8)
         if self.stamped:
+            check_stamps(stamp_ns)
             seconds, nanoseconds = np.divmod(np.asarray(stamp_ns, dtype=np.int64), _NS)
-            if len(seconds) and (seconds.max() >= 2**31 or seconds.min() < -(2**31)):
-                raise LayoutError("a stamp is outside the years 1901 to 2038 that a ROS 2 time can hold")
             out[STAMP_SEC] = seconds
             out[STAMP_NANOSEC] = nanoseconds
         for name in self.columns:
@@ -176,6 +175,16 @@ class Layout:
         expected = np.frombuffer(self.template, dtype=np.uint8)[self.fixed]
         same: NDArray[np.bool_] = (messages[:, : len(self.template)][:, self.fixed] == expected).all(axis=1)
         return same
+
+
+def check_stamps(stamp_ns: NDArray[np.int64]) -> None:
+    """Check that a ROS 2 time can hold the stamps (n,) [ns].
+
+    Raises:
+        LayoutError: one does not fit into its 32-bit seconds.
+    """
+    if len(stamp_ns) and not (stamp_ns.min() >= -(2**31) * _NS and stamp_ns.max() < 2**31 * _NS):
+        raise LayoutError("a stamp is outside the years 1901 to 2038 that a ROS 2 time can hold")
 
 
 def layout(definition: Definition, source: Source, little: bool = True) -> Layout:

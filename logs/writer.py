@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from estimation.events import Event, Imu
 from logs.bulk import Block, merged_chunks
-from logs.cdr import FRAME_ID, STAMP_NANOSEC, STAMP_SEC, Columns, Layout, LayoutError, layout
+from logs.cdr import FRAME_ID, STAMP_NANOSEC, STAMP_SEC, Columns, Layout, LayoutError, check_stamps, layout
 from logs.container import Container, create
 from logs.definition import parse
 from logs.encode import encode
@@ -119,17 +119,14 @@ class FlightWriter:
 
         Raises:
             LogError: a topic is unknown and names no message type (metadata ``message_type``), columns do not
-                fit it, or a time cannot be stored.
+                fit it, or a time cannot be stored: found before any message is written; or the disk fails.
         """
         blocks = [self._block(s) for s in series if len(s)]
         if not blocks:
             return
         self._guard(self._container.flush)
-        try:
-            for records, entries in merged_chunks(blocks, _CHUNK_BYTES):
-                self._guard(self._container.write_chunk, records, entries)
-        except LayoutError as error:
-            raise LogError(self.path, str(error), "check the stamps and the clock's constant") from None
+        for records, entries in merged_chunks(blocks, _CHUNK_BYTES):
+            self._guard(self._container.write_chunk, records, entries)
 
     def write_event(self, event: Event) -> None:
         """Write one sensor event, as its topic's message; what ``logs.events`` reads back is this event."""
@@ -279,6 +276,11 @@ class FlightWriter:
         channel, built = self._prepare(series)
         if built.columns and series.data.dtype.names is None:
             raise LogError(self.path, f"{series.topic} has no columns", "give it a structured array")
+        if built.stamped:
+            try:
+                check_stamps(series.stamp_ns + offset)
+            except LayoutError as error:
+                raise LogError(self.path, str(error), "check the stamps and the clock's constant") from None
         return Block(channel, built, series, offset, np.argsort(series.arrival_ns, kind="stable"))
 
     def _prepare(self, series: Series) -> tuple[int, Layout]:

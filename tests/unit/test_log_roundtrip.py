@@ -221,6 +221,18 @@ def test_columns_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     same(one, open_flight(tmp_path / "f.mcap").series("/baro")[0])
 
 
+def test_what_cannot_be_stored_is_refused_before_any_of_it_is_written(tmp_path: Path) -> None:
+    # Several chunks of messages, the last of which is stamped beyond what a message can hold.
+    long = series("/baro", 40_000, 1, np.random.default_rng(0))
+    long.stamp_ns[-1] += 2**62
+    short = series("/baro", 10, 1, np.random.default_rng(1))
+    with FlightWriter(tmp_path / "f.mcap", clock_offsets_ns={"autopilot": UTC}) as writer:
+        with pytest.raises(LogError, match="2038"):
+            writer.write_series(long)
+        writer.write_series(short)
+    same(short, open_flight(tmp_path / "f.mcap").series("/baro")[0])
+
+
 def test_any_series_with_a_definition_of_its_own_is_written(tmp_path: Path) -> None:
     data = np.zeros(3, dtype=[("depth", "f4"), ("beams", "u2", (2,))])
     data["depth"] = [1, 2, 3]
