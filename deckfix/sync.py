@@ -74,8 +74,8 @@ class LatencyProfile:
 
     ``grid_s`` (n,) ascending and ``log_likelihood`` (n,) are the profile, largest value 0; ``halves`` the latency and
     the sigma of each half of the flight; ``fixes`` how many vision fixes were compared; ``rotation_radps`` how fast the
-    vehicle turned meanwhile (rms); ``by_arrival`` says that the fixes' own stamps were thrown away; ``clocks`` are the
-    other clocks against the inertial one at the flight's end.
+    vehicle turned meanwhile (rms, less noise); ``by_arrival`` says that the fixes' own stamps were thrown away;
+    ``clocks`` are the other clocks against the inertial one at the flight's end.
     """
 
     latency_s: float
@@ -143,7 +143,7 @@ def latency_profile(
     # The replays hold the latency themselves: no prior of the log's own may come in between.
     known = replace(facts or Facts(), vision_by_arrival=False)
     found = profile_of(_Replay(mapped, config, known, engine), jobs)
-    found = replace(found, rotation_radps=_rotation(mapped), by_arrival=by_arrival, clocks=clocks)
+    found = replace(found, rotation_radps=rotation_radps(mapped), by_arrival=by_arrival, clocks=clocks)
     if found.rotation_radps < config.vision.latency_rate_radps:
         # What is left then is how the vehicle moves against the raft, and that tells of the raft's sway as well.
         return replace(found, status=LatencyStatus.UNOBSERVABLE, reason=HARDLY_TURNED, sigma_s=UNKNOWN_S)
@@ -358,12 +358,17 @@ def _below_zero(latency_s: float, sigma_s: float) -> bool:
     return latency_s < -NEGATIVE_SIGMA * sigma_s
 
 
-def _rotation(batch: EventBatch) -> float:
-    """Return the rms angular velocity [rad/s] over the time in which there are fixes."""
+def rotation_radps(batch: EventBatch) -> float:
+    """Return the rms angular velocity [rad/s] over the time in which there are fixes, without the gyro's white noise:
+    that of half the mean squared difference of neighbouring samples, as the filter takes it.
+    """
     rows = batch.rows
     seen = rows["stamp_ns"][rows["kind"] == Kind.VISION]
     imu = rows[rows["kind"] == Kind.IMU]
     imu = imu[(imu["stamp_ns"] >= seen.min()) & (imu["stamp_ns"] <= seen.max())]
     rates = imu["value"][:, :3]
     rates = rates[np.isfinite(rates).all(axis=1)]
-    return float(np.sqrt(np.mean(np.sum(rates**2, axis=1)))) if len(rates) else 0.0
+    if len(rates) < 2:
+        return 0.0
+    noise = 0.5 * np.mean(np.sum(np.diff(rates, axis=0) ** 2, axis=1))
+    return math.sqrt(max(0.0, float(np.mean(np.sum(rates**2, axis=1)) - noise)))

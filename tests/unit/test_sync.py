@@ -16,7 +16,7 @@ from small_flight import deck_recording
 from deckfix import sync
 from deckfix.cli import main
 from deckfix.replaying import facts
-from deckfix.sync import KEY_DTYPE, LatencyStatus, Replay, latency_profile, profile_of
+from deckfix.sync import KEY_DTYPE, LatencyStatus, Replay, latency_profile, profile_of, rotation_radps
 from deckfix.sync_command import digest, with_latency
 from estimation.clock import SyncStatus
 from estimation.clockbank import ClockSummary
@@ -159,6 +159,20 @@ def test_the_latency_is_found_where_the_vehicle_rocks(flight: SimulatedFlight, t
     assert np.degrees(found.rotation_radps) > 15.0
     assert [c.clock for c in found.clocks] == [COMPANION]
     assert found.clocks[0].skew_ppm == pytest.approx(30.0, abs=4.0 * found.clocks[0].skew_sigma_ppm + 1.0)
+
+
+def test_a_shaken_gyro_is_no_rotation(flight: SimulatedFlight) -> None:
+    rows = flight.batch.rows.copy()
+    imu = rows["kind"] == Kind.IMU
+    noise = np.random.default_rng(0).normal(0.0, 0.1, (int(imu.sum()), 3))
+
+    def turning(rates: NDArray[np.float64]) -> float:
+        rows["value"][imu, :3] = rates
+        return rotation_radps(EventBatch(rows, flight.batch.sensors, flight.batch.clocks))
+
+    turned = flight.batch.rows["value"][imu, :3]
+    assert turning(turned + noise) == pytest.approx(turning(turned), rel=0.03)
+    assert turning(noise) < 0.035
 
 
 @pytest.mark.parametrize(
