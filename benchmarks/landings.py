@@ -11,7 +11,8 @@ use relative to the deck, to tell what is gained by going down slowly from what 
 ``--full`` flies 200 in each sea.
 
 Printed are the touchdowns inside r_land, the descents broken off for the holding height, the aborts, the horizontal
-miss and the speed into the deck at first contact. A first contact on the way up counts as none of a descent.
+miss and the speed into the deck at first contact. Outside is what touches first, or stands in the end, outside r_land.
+A first contact on the way up counts as none of a descent.
 Exit status 1 when a target is missed, unless --no-gate is given.
 """
 
@@ -90,6 +91,7 @@ class Landing:
     duration_s: float
     speed_mps: float
     miss_m: float
+    stands_m: float
     in_descent: bool
 
 
@@ -118,8 +120,14 @@ def judged(flown: Flown) -> Landing:
     )
     touch = flown.contact
     if touch is None:
-        return Landing(flown.end, aborts, rises, float(flown.t_s[-1]), float("nan"), float("nan"), False)
-    return Landing(flown.end, aborts, rises, touch.t_s, touch.speed_mps, touch.miss_m, touch.descending)
+        return Landing(
+            flown.end, aborts, rises, float(flown.t_s[-1]), float("nan"), float("nan"), float("nan"), False
+        )
+    end = flown.truth[-1, :2] - flown.deck[-1, :2]
+    stands = float(np.hypot(*end)) if flown.end == "landed" else float("nan")
+    return Landing(
+        flown.end, aborts, rises, touch.t_s, touch.speed_mps, touch.miss_m, stands, touch.descending
+    )
 
 
 def summary(flights: list[Landing], radius: float) -> dict[str, float]:
@@ -128,7 +136,7 @@ def summary(flights: list[Landing], radius: float) -> dict[str, float]:
     out = {
         "landings": float(len(speed)),
         "flights": float(len(flights)),
-        "outside": float(np.sum(miss > radius)),
+        "outside": float(sum(f.miss_m > radius or f.stands_m > radius for f in flights)),
     }
     out["away from the descent"] = float(sum(np.isfinite(f.speed_mps) and not f.in_descent for f in flights))
     out["aborts"] = float(sum(f.aborts for f in flights))
@@ -194,9 +202,9 @@ def main() -> None:
                 flown += found[guide]["landings"]
             print(line(guide, found[guide]), dict(Counter(f.end for f in chosen)), flush=True)
         print(f"  {time.perf_counter() - begin:.0f} s", flush=True)
-        # Each contact's speed and miss, and whether it was in a descent: runs with other seeds can be put together.
+        # Each contact's speed and miss, the place in the end, and whether it was in a descent: to put runs together.
         contacts = {
-            g: [[one[g].speed_mps, one[g].miss_m, one[g].in_descent] for one in flights]
+            g: [[one[g].speed_mps, one[g].miss_m, one[g].stands_m, one[g].in_descent] for one in flights]
             for g in arguments.guide
         }
         document[sea] = {"summary": found, "contacts": contacts}

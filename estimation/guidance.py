@@ -30,6 +30,10 @@ LEGS_M = 0.1
 PRESS_MPS = 1.0
 """What the deck holds up is asked to go down so much faster than it goes: more than a deck's rate changes by within the
 vehicle's answer, so that it stays on a deck that begins to fall, and its falling short of it can be told."""
+FRESH_S = 0.4
+"""A target is in view while its last fused fix is younger than this."""
+PART_SEEN = 0.2
+"""Share of the height over the deck by which the target's middle may lie outside of the picture."""
 CONTACT_SPREAD_S = 0.3
 """A quiet moment lasts from this long before the contact expected until this long after it."""
 
@@ -120,6 +124,18 @@ def probably_inside_at_contact(e: Estimate, forecast: DeckForecast | None, c: La
     carried = min(ahead, c.response_level_s)
     left = (e.deck[:2] + carried * e.deck[3:5]) * math.exp(-c.follow_gain * (ahead - carried))
     return inside_probability(left, forecast.apart_at(ahead), c.r_land_m)
+
+
+def keeps_sight(e: Estimate, c: LandingConfig) -> bool:
+    """Tell whether a vehicle that goes on down will have the target in view when it has answered, or has met the deck
+    by then. Of a target beside the picture some of the rings are enough.
+    """
+    height = -float(e.deck[2])
+    if time_to_contact(height, c) <= c.response_s:
+        return True
+    then = e.deck[:2] + c.response_s * e.deck[3:5]
+    lower = height - c.response_s * descent_rate(height, c)
+    return math.hypot(then[0], then[1]) < (math.tan(0.5 * c.field_of_view_rad) + PART_SEEN) * lower
 
 
 def probably_met(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -> float:
@@ -215,6 +231,9 @@ def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
     else:
         aim = np.array([0.0, 0.0, -c.gear_m])
         descent = descent_rate(height, c)
+        if seen.detection_age_s < FRESH_S and not keeps_sight(e, c):
+            # The deck's height is kept until the vehicle is over the target again.
+            descent = 0.0
     velocity[2] = descent - deck_rate_ahead(e, seen.forecast, c.response_s)
     if p.descent_ns is not None:
         velocity[2] = max(float(velocity[2]), _pressing(p, seen, e, c))

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from estimation.guidance import (
+    FRESH_S,
     decide,
     heading_rad,
     held_up,
@@ -40,8 +41,6 @@ from estimation.state import PL0
 if TYPE_CHECKING:
     from estimation.output import Estimate
 
-FRESH_S = 0.4
-"""A target is in view while its last fused fix is younger than this."""
 FOUND_S = 0.5
 """How long it must be in view, and how long the other conditions must hold, before the next mode."""
 ALIGNED_S = 1.0
@@ -59,6 +58,9 @@ FASTEST_DRIFT_MPS = 0.5
 """The velocity that a lasting error may add: more than a drift unforeseen and an autopilot's own error come to."""
 LEFT_PROBABILITY = 0.5
 """The observation ends when being inside r_track is no more probable than this."""
+
+BOUNCE = 0.1
+"""To touch the deck on the way up is so bad as a share of standing outside r_land."""
 
 _OVER_THE_DECK = (Mode.TRACKING, Mode.OBSERVATION, Mode.LANDING)
 
@@ -170,18 +172,18 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
         if stopped:
             return replace(p, met_ns=seen.now_ns)
         p = _holding(p, met > 0.5 or (blind and p.met_ns is not None), seen)
-        if blind and p.met_ns is not None:
-            late = _held_s(p, seen) > c.response_s + OVERDUE_S + c.contact_s
-            return _rise(p, Reason.NO_CONTACT, seen) if late else p
+        held = _held_s(p, seen)
+        if blind and held > c.response_s + OVERDUE_S + c.contact_s:
+            return _rise(p, Reason.NO_CONTACT, seen)
         # Judged is the place at contact: as far ahead as an answer takes while the target is in view, all the way
-        # where it is not. A vehicle that stands before it has answered more probably than not, or more probably
-        # than it stands outside, is not led up again for its place.
+        # where it is not.
         if blind:
             inside, asked = probably_inside_at_contact(e, seen.forecast, c), c.land_probability
         else:
             ahead = min(time_to_contact(height, c), c.response_s)
             inside, asked = probably_inside(e, c.r_land_m, ahead), c.abort_probability
-        if inside < min(asked, 1.0 - met) and met < 0.5:
+        # A vehicle that should stand by now is not led up again for its place.
+        if held < c.response_s and 1.0 - inside > max(1.0 - asked, BOUNCE * met):
             return _rise(p, Reason.OUTSIDE_R_LAND, seen)
         return p
     low = height < c.hold_height_m + HOLD_TOLERANCE_M

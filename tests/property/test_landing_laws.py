@@ -12,16 +12,18 @@ from hypothesis import strategies as st
 from estimation.ahead import DeckForecast
 from estimation.frames import euler_to_quat
 from estimation.guidance import (
+    FRESH_S,
     PRESS_MPS,
     deck_rate_ahead,
     held_up,
     inside_probability,
+    keeps_sight,
     probably_inside_at_contact,
     probably_met,
     search_altitude_m,
     time_to_contact,
 )
-from estimation.landing import FRESH_S, step
+from estimation.landing import BOUNCE, step
 from estimation.landing_config import LandingConfig
 from estimation.modes import EXPLANATIONS, Mode, Progress, Reason, Situation
 from estimation.output import Estimate
@@ -111,6 +113,8 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
             pressed = after.met_ns is not None and after.descent_ns is not None
             most = max(C.touchdown_rate_mps, e.velocity_mps[2] + PRESS_MPS) if pressed else -math.inf
             assert decision.velocity_mps[2] <= max(most, C.approach_rate_mps - rate) + 1e-12
+            if after.descent_ns is not None and seen.detection_age_s < FRESH_S and not keeps_sight(e, C):
+                assert decision.velocity_mps[2] <= max(most, -rate) + 1e-12
             if before.mode is Mode.LANDING:
                 risen = before.rose_ns is not None and seen.now_ns - before.rose_ns <= C.lost_s * 1e9
                 stands = after.descent_ns is not None and held_up(after, e, C)
@@ -126,9 +130,11 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
                 if blind and not fresh:
                     inside = probably_inside_at_contact(e, seen.forecast, C)
                 asked = C.land_probability if fresh or blind else C.abort_probability
-                # Nearer than it could answer, or where it may stand, it is not led up again.
+                # Where touching on the way up is the greater risk, or it stands or should by now, it is not led up.
                 met = 0.0 if fresh else probably_met(e, seen.forecast, C)
-                assert after.met_ns is not None or inside >= min(asked, 1.0 - met) - 1e-9
+                stood = after.met_ns is not None and seen.now_ns - after.met_ns >= C.response_s * 1e9
+                stood = stood or (not fresh and held_up(after, e, C))
+                assert stood or 1.0 - inside <= max(1.0 - asked, BOUNCE * met) + 1e-9
                 if met < 0.5 and not blind and after.met_ns is not None:
                     # In sight there is one more reason to hold that it stands: it does not go down as it is told.
                     assert before.answers_mps is not None

@@ -16,6 +16,7 @@ from estimation.guidance import (
     descent_rate,
     held_up,
     inside_probability,
+    keeps_sight,
     probably_inside_at_contact,
     probably_met,
     search_altitude_m,
@@ -162,12 +163,13 @@ def test_from_the_deck_the_vehicle_rises_as_fast_as_it_would_in_an_abort() -> No
     assert step(landing(False), seen, low)[1].velocity_mps[2] == pytest.approx(-c.climb_mps)
 
 
-@pytest.mark.parametrize(("closing_mps", "stays"), [(0.25, True), (0.0, False)])
-def test_what_stands_before_it_could_be_led_up_stays(closing_mps: float, stays: bool) -> None:
-    """The last two centimetres take less than the answer at the touchdown's rate; from rest it can climb."""
+@pytest.mark.parametrize(("met_s", "stays"), [(0.31, True), (0.1, False)])
+def test_what_should_stand_by_now_is_not_led_up_for_its_place(met_s: float, stays: bool) -> None:
+    """Beside the circle for sure; contact is probable, and has been for longer or shorter than an answer takes."""
     near = estimate(10**9, (0.6, 0.0, -0.12))
-    near.deck[5] = closing_mps
-    p, _ = step(landing(), Situation(10**9, near, 0.1), LandingConfig())
+    near.deck[5] = 0.25
+    before = replace(landing(), met_ns=10**9 - round(met_s * 1e9))
+    p, _ = step(before, Situation(10**9, near, 0.1), LandingConfig())
     assert (p.descent_ns is not None) == stays
 
 
@@ -175,12 +177,45 @@ def test_what_stands_before_it_could_be_led_up_stays(closing_mps: float, stays: 
 def test_a_deck_that_may_come_up_first_is_not_broken_off_from_for_a_lesser_doubt(
     sigma_m: float, stays: bool
 ) -> None:
-    """Some 8 in 100 to stand outside, from 0.25 m over the deck: more probably met than that, or surely not."""
+    """12 in 1000 to stand outside, from 0.25 m over the deck: a tenth of 16 in 100 to be met first, or surely not."""
     blind = estimate(10**9, (0.2, 0.0, -0.25))
-    blind.deck_covariance[0, 0] = blind.deck_covariance[1, 1] = 0.19**2
+    blind.deck_covariance[0, 0] = blind.deck_covariance[1, 1] = 0.122**2
     blind.deck_covariance[2, 2] = sigma_m**2
     p, _ = step(landing(), Situation(10**9, blind, 0.6), LandingConfig())
     assert (p.descent_ns is not None) == stays
+
+
+@pytest.mark.parametrize(
+    ("relative", "age_s", "pauses"),
+    [
+        ((0.1, 0.0, -0.4), 0.1, False),
+        ((0.3, 0.0, -0.4), 0.1, True),
+        ((0.0, 0.3, -0.4), 0.1, True),
+        ((0.3, 0.0, -0.9), 0.1, False),
+        ((0.3, 0.0, -0.15), 0.1, False),
+        ((0.1, 0.0, -0.15), 0.6, False),
+    ],
+)
+def test_the_descent_pauses_where_it_would_lose_sight_of_the_target(
+    relative: tuple[float, float, float], age_s: float, pauses: bool
+) -> None:
+    """Lower the picture is smaller; so near that contact comes first, or without sight, the descent goes on."""
+    c = LandingConfig()
+    seen = Situation(10**9, estimate(10**9, relative, 0.1), age_s, forecast(10**9, 0.1))
+    p, said = step(landing(), seen, c)
+    assert p.descent_ns is not None
+    descent = 0.0 if pauses else descent_rate(-relative[2], c)
+    assert said.velocity_mps[2] == pytest.approx(descent - 0.1)
+
+
+def test_a_pause_ends_where_the_vehicle_is_carried_over_the_target() -> None:
+    c = LandingConfig()
+    e = estimate(10**9, (0.3, 0.0, -0.4))
+    assert not keeps_sight(e, c)
+    e.deck[3] = -0.5
+    assert keeps_sight(e, c)
+    e.deck[0], e.deck[3] = 0.1, 0.5
+    assert not keeps_sight(e, c)
 
 
 @pytest.mark.parametrize(
