@@ -118,7 +118,7 @@ def probably_inside_at_contact(e: Estimate, forecast: DeckForecast | None, c: La
     The relative velocity carries the vehicle on until it answers; from then on it closes what it knows to be off.
     What it does not know grows meanwhile (``DeckForecast.apart_at``).
     """
-    ahead = time_to_contact(-float(e.deck[2]), c)
+    ahead = max(0.0, -float(e.deck[2]) - c.gear_m) / c.approach_rate_mps
     if forecast is None:
         return probably_inside(e, c.r_land_m, ahead)
     carried = min(ahead, c.response_level_s)
@@ -230,15 +230,28 @@ def decide(p: Progress, seen: Situation, c: LandingConfig) -> Decision:
         descent = min(c.approach_rate_mps, max(-c.climb_mps, gain * (height - c.hold_height_m)))
     else:
         aim = np.array([0.0, 0.0, -c.gear_m])
-        descent = descent_rate(height, c)
-        if seen.detection_age_s < FRESH_S and not keeps_sight(e, c):
-            # The deck's height is kept until the vehicle is over the target again.
-            descent = 0.0
+        descent = _going_down(seen, e, c)
     velocity[2] = descent - deck_rate_ahead(e, seen.forecast, c.response_s)
     if p.descent_ns is not None:
         velocity[2] = max(float(velocity[2]), _pressing(p, seen, e, c))
     inside, quiet = probably_inside(e, c.r_land_m), probably_quiet(e, seen.forecast, c)
     return Decision(p.mode, p.reason, velocity, p.yaw_rad, c.land_tilt_rad, aim, inside, quiet)
+
+
+def _going_down(seen: Situation, e: Estimate, c: LandingConfig) -> float:
+    """Return the rate [m/s] relative to the deck of the last descent now.
+
+    Where going on would lose sight of the target the deck's height is kept. Without sight the doubt grows with time,
+    and the rest is gone as fast as may be. In sight it is ``descent_rate``, but no slower than the touchdown's with the
+    1-sigma of the deck's rate: a deck that falls faster than foreseen would keep the vehicle hanging over it.
+    """
+    if seen.detection_age_s >= FRESH_S:
+        return c.approach_rate_mps
+    if not keeps_sight(e, c):
+        return 0.0
+    unknown = 0.0 if seen.forecast is None else seen.forecast.rate_at(c.response_s)[1]
+    firm = c.touchdown_rate_mps + unknown
+    return min(c.approach_rate_mps, max(firm, descent_rate(-float(e.deck[2]), c)))
 
 
 def _pressing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> float:

@@ -59,7 +59,7 @@ FASTEST_DRIFT_MPS = 0.5
 LEFT_PROBABILITY = 0.5
 """The observation ends when being inside r_track is no more probable than this."""
 
-BOUNCE = 0.1
+BOUNCE = 0.01
 """To touch the deck on the way up is so bad as a share of standing outside r_land."""
 
 _OVER_THE_DECK = (Mode.TRACKING, Mode.OBSERVATION, Mode.LANDING)
@@ -173,7 +173,7 @@ def _landing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> Pro
             return replace(p, met_ns=seen.now_ns)
         p = _holding(p, met > 0.5 or (blind and p.met_ns is not None), seen)
         held = _held_s(p, seen)
-        if blind and held > c.response_s + OVERDUE_S + c.contact_s:
+        if blind and held > c.response_s + OVERDUE_S:
             return _rise(p, Reason.NO_CONTACT, seen)
         # Judged is the place at contact: as far ahead as an answer takes while the target is in view, all the way
         # where it is not.

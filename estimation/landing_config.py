@@ -60,7 +60,7 @@ class LandingConfig(Table, frozen=True):
             "being inside r_land must be this probable before the vehicle goes down, and at contact while it goes down "
             "low without sight of the target"
         ),
-    ] = 0.99
+    ] = 0.998
     abort_probability: Annotated[
         float,
         share("in sight of it, the descent is broken off below this probability of being inside r_land"),
@@ -119,7 +119,11 @@ class LandingConfig(Table, frozen=True):
     ] = 0.5
     touchdown_rate_mps: Annotated[
         float,
-        positive("descent rate relative to the deck down to contact; not above approach_rate_mps", "m/s"),
+        positive(
+            "descent rate relative to the deck down to contact, and the 1-sigma of the deck's rate more; not above "
+            "approach_rate_mps",
+            "m/s",
+        ),
     ] = 0.25
     quiet_rate_mps: Annotated[float, positive("the deck is quiet while its rate is below this", "m/s")] = 0.3
     quiet_probability: Annotated[
