@@ -1,10 +1,11 @@
 """The camera's latency from a whole flight: the likelihood of all innovations as a function of it.
 
-The flight is replayed with the latency held at each value of a grid, then of finer ones about the best. What a replay
-says of a latency is the log-likelihood of its innovations, ``sum -(rho(NIS) + log det S) / 2`` with rho Huber's
-function at the filter's own bound, over the measurements that every replay compared. Its peak is the latency. The
-sigma is the larger of two: that of the peak's curvature, which is right if the models are, and that of the slopes of
-disjoint parts of the flight, which needs no such trust ("sandwich").
+The flight is replayed once for the platform's motion to be learned, and then, with that and the latency held, at each
+value of a grid, then of finer ones about the best. What a replay says of a latency is the log-likelihood of its
+innovations, ``sum -(rho(NIS) + log det S) / 2`` with rho Huber's function at the filter's own bound, over the
+measurements that every replay compared. Its peak is the latency. The sigma is the larger of two: that of the peak's
+curvature, which is right if the models are, and that of the slopes of disjoint parts of the flight, which needs no such
+trust ("sandwich").
 
 Latency >= 0: the content is older than its stamp, t_content = map(t_stamp) - latency. No content is newer, but what the
 map errs by is found with it: where the exchanges of the clocks take longer one way than the other, up to half their
@@ -142,7 +143,7 @@ def latency_profile(
     mapped, clocks = on_inertial_clock(batch, by_arrival)
     # The replays hold the latency themselves: no prior of the log's own may come in between.
     known = replace(facts or Facts(), vision_by_arrival=False)
-    found = profile_of(_Replay(mapped, config, known, engine), jobs)
+    found = profile_of(_Replay(mapped, _with_sea(mapped, config, known, engine), known, engine), jobs)
     found = replace(found, rotation_radps=rotation_radps(mapped), by_arrival=by_arrival, clocks=clocks)
     if found.rotation_radps < config.vision.latency_rate_radps:
         # What is left then is how the vehicle moves against the raft, and that tells of the raft's sway as well.
@@ -152,6 +153,19 @@ def latency_profile(
         reason = "fixes cannot be newer than their arrival: the stamps of the inertial samples are wrong"
         return replace(found, status=LatencyStatus.INCONSISTENT, reason=reason)
     return found
+
+
+def _with_sea(batch: EventBatch, config: Config, facts: Facts, engine: EngineName) -> Config:
+    """Return the configuration with the platform's motion as a flight's estimator has learned it in the end.
+
+    A replay that learned it anew would not be comparable with the others; one that knows only any sea takes the
+    platform's motion for the vehicle's, and the vehicle's for an age.
+    """
+    c = msgspec.structs.replace
+    config = c(config, platform=c(config.platform, use=True))
+    estimator = LandingEstimator(config, engine, facts)
+    estimator.run(batch)
+    return c(config, platform=c(config.platform, motion=tuple(estimator.motion.tolist())))
 
 
 def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:

@@ -45,6 +45,10 @@ class Origin(Table, frozen=True):
     ] = None
 
 
+Motion = Annotated[tuple[Annotated[float, Meta(gt=0.0)], ...], Meta(min_length=22, max_length=22)]
+"""Parameters of the platform's motion (``estimation.deck``)."""
+
+
 class PlatformConfig(Table, frozen=True):
     """The floating platform: an anchored place, sway about it, a level, and heave."""
 
@@ -91,6 +95,14 @@ class PlatformConfig(Table, frozen=True):
         float, not_negative("interval at which the heave's spectrum is learned anew; 0: never", "s")
     ] = 2.0
     learn_window_s: Annotated[float, positive("how much of the past it is learned from", "s")] = 60.0
+    motion: Annotated[
+        Motion | None,
+        number(
+            "the motion as an earlier run learned it (LandingEstimator.motion), used until it is learned anew; None: "
+            "any sea of the sizes and periods above",
+            "mixed",
+        ),
+    ] = None
 
 
 class FilterConfig(Table, frozen=True):

@@ -68,7 +68,11 @@ OUTPUT_SIZE = 8
 
 
 def prior_motion(platform: PlatformConfig) -> Array:
-    """Return the parameters of the motion (22,) before it is learned: chains of any sea, spread about their periods."""
+    """Return the parameters of the motion (22,) before it is learned: those that are known from before, or chains of
+    any sea, spread about their periods.
+    """
+    if platform.motion is not None:
+        return np.array(platform.motion)
     heave = any_sea(platform.heave_sigma_m, 2.0 * math.pi / platform.heave_period_s, platform.heave_damping)
     sway = any_sea(platform.sway_sigma_m, 2.0 * math.pi / platform.sway_period_s, platform.sway_damping)
     return np.array([*heave, *sway, *sway, platform.drift_sigma_mps])

@@ -114,6 +114,12 @@ class LandingEstimator:
         return self._learner.model if self._learner is not None else None
 
     @property
+    def motion(self) -> Array:
+        """The parameters of the platform's motion (22,) as learned by now (``platform.motion``)."""
+        known = None if self._learner is None else self._learner.parameters
+        return prior_motion(self.config.platform) if known is None else known.copy()
+
+    @property
     def ready(self) -> bool:
         """True once estimates come out."""
         return self._engine is not None

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,6 +22,7 @@ from deckfix.sync_command import digest, with_latency
 from estimation.clock import SyncStatus
 from estimation.clockbank import ClockSummary
 from estimation.config import load_config, parse_config
+from estimation.deck import prior_motion
 from estimation.estimator import LandingEstimator
 from estimation.events import COMPANION, EventBatch, Kind
 from logs.reader import open_flight
@@ -159,6 +161,27 @@ def test_the_latency_is_found_where_the_vehicle_rocks(flight: SimulatedFlight, t
     assert np.degrees(found.rotation_radps) > 15.0
     assert [c.clock for c in found.clocks] == [COMPANION]
     assert found.clocks[0].skew_ppm == pytest.approx(30.0, abs=4.0 * found.clocks[0].skew_sigma_ppm + 1.0)
+
+
+def test_a_motion_that_is_known_foresees_the_fixes_better_than_any_sea(flight: SimulatedFlight) -> None:
+    c = msgspec.structs.replace
+    config = flight.scenario.config
+    learning = LandingEstimator(config)
+    assert np.array_equal(learning.motion, prior_motion(config.platform))
+    learning.run(flight.batch)
+    assert not np.array_equal(learning.motion, prior_motion(config.platform))
+
+    def likelihood(motion: tuple[float, ...] | None) -> float:
+        held = c(config, platform=c(config.platform, learn_s=0.0, motion=motion))
+        estimator = LandingEstimator(held)
+        run = estimator.run(flight.batch)
+        assert np.array_equal(estimator.motion, prior_motion(held.platform))
+        r = run.records[(run.records["sensor"] == run.sensors.index("vision")) & (run.records["dof"] > 0)]
+        return -0.5 * float(np.sum(r["nis"] + r["log_det"]))
+
+    known = tuple(learning.motion.tolist())
+    assert prior_motion(c(config.platform, motion=known)).tolist() == list(known)
+    assert likelihood(known) > likelihood(None) + 5.0
 
 
 def test_a_shaken_gyro_is_no_rotation(flight: SimulatedFlight) -> None:
