@@ -3,9 +3,10 @@
 The flight is replayed once for the platform's motion to be learned, and then, with that and the latency held, at each
 value of a grid, then of finer ones about the best. What a replay says of a latency is the log-likelihood of its
 innovations, ``sum -(rho(NIS) + log det S) / 2`` with rho Huber's function at the filter's own bound, over the
-measurements that every replay compared. Its peak is the latency. The sigma is the larger of two: that of the peak's
-curvature, which is right if the models are, and that of the slopes of disjoint parts of the flight, which needs no such
-trust ("sandwich").
+measurements that every replay compared. Its peak is the latency. The sigma is the largest of three: that of the peak's
+curvature, which is right if the models are; that of the slopes of disjoint parts of the flight, which needs no such
+trust ("sandwich"); and the filter's own in the first replay, which carries the camera's mounting and the gyro's noise:
+both can pass for an age all flight long.
 
 Latency >= 0: the content is older than its stamp, t_content = map(t_stamp) - latency. No content is newer, but what the
 map errs by is found with it: where the exchanges of the clocks take longer one way than the other, up to half their
@@ -143,7 +144,8 @@ def latency_profile(
     mapped, clocks = on_inertial_clock(batch, by_arrival)
     # The replays hold the latency themselves: no prior of the log's own may come in between.
     known = replace(facts or Facts(), vision_by_arrival=False)
-    found = profile_of(_Replay(mapped, _with_sea(mapped, config, known, engine), known, engine), jobs)
+    informed, sigma = _with_sea(mapped, config, known, engine)
+    found = profile_of(_Replay(mapped, informed, known, engine), jobs, sigma)
     found = replace(found, rotation_radps=rotation_radps(mapped), by_arrival=by_arrival, clocks=clocks)
     if found.rotation_radps < config.vision.latency_rate_radps:
         # What is left then is how the vehicle moves against the raft, and that tells of the raft's sway as well.
@@ -155,8 +157,9 @@ def latency_profile(
     return found
 
 
-def _with_sea(batch: EventBatch, config: Config, facts: Facts, engine: EngineName) -> Config:
-    """Return the configuration with the platform's motion as a flight's estimator has learned it in the end.
+def _with_sea(batch: EventBatch, config: Config, facts: Facts, engine: EngineName) -> tuple[Config, float]:
+    """Return the configuration with the platform's motion as a flight's estimator has learned it in the end, and the
+    least 1-sigma [s] that this estimator's own age of the fixes came to.
 
     A replay that learned it anew would not be comparable with the others; one that knows only any sea takes the
     platform's motion for the vehicle's, and the vehicle's for an age.
@@ -164,13 +167,15 @@ def _with_sea(batch: EventBatch, config: Config, facts: Facts, engine: EngineNam
     c = msgspec.structs.replace
     config = c(config, platform=c(config.platform, use=True))
     estimator = LandingEstimator(config, engine, facts)
-    estimator.run(batch)
-    return c(config, platform=c(config.platform, motion=tuple(estimator.motion.tolist())))
+    run = estimator.run(batch)
+    sigma = run.sigma[:, run.state_names.index("camera_latency.t")]
+    informed = c(config, platform=c(config.platform, motion=tuple(estimator.motion.tolist())))
+    return informed, float(sigma.min()) if len(sigma) else 0.0
 
 
-def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:
+def profile_of(replay: Replay, jobs: int | None = None, least_sigma_s: float = 0.0) -> LatencyProfile:
     """Return the latency that ``replay`` shows: latency [s] -> keys of the measurements compared, ascending, and the
-    log-likelihood of each.
+    log-likelihood of each. It is known no better than to ``least_sigma_s``.
     """
     profile = _Profile(replay, jobs or os.cpu_count() or 1)
     coarse = np.arange(MIN_LATENCY_S, MAX_LATENCY_S + 1e-9, COARSE_S)
@@ -189,7 +194,7 @@ def profile_of(replay: Replay, jobs: int | None = None) -> LatencyProfile:
         near = np.searchsorted(grid, around)
         peak, sigma = _parabola(grid[near], values[near].sum(axis=1))
     parts = _parts(grid[near], stamps, values[near], PARTS)
-    sigma = max(sigma, _sandwich(parts, peak))
+    sigma = max(sigma, _sandwich(parts, peak), least_sigma_s)
     fixes = profile.fixes()
     halves = tuple(_half(parts[:, h]) for h in (slice(0, PARTS // 2), slice(PARTS // 2, PARTS)))
     status, reason = _judged(peak, sigma, halves, fixes, rival)

@@ -112,6 +112,17 @@ def test_a_parabola_gives_its_peak_and_its_sigma(peak_ms: float, sigma_ms: float
     assert np.all(np.diff(found.grid_s) > 0.0)
 
 
+@pytest.mark.parametrize(
+    ("least_ms", "status"), [(2.0, LatencyStatus.ESTIMATED), (8.0, LatencyStatus.UNOBSERVABLE)]
+)
+def test_no_profile_is_surer_than_it_is_told_to_be(least_ms: float, status: LatencyStatus) -> None:
+    replay = parabolas(np.array([0.05]), 5e-4)
+    found = profile_of(replay, jobs=1, least_sigma_s=least_ms * 1e-3)
+    assert found.latency_s == profile_of(replay, jobs=1).latency_s
+    assert found.sigma_s == pytest.approx(least_ms * 1e-3)
+    assert found.status is status
+
+
 def test_parts_that_scatter_widen_the_sigma() -> None:
     rng = np.random.default_rng(4)
     peaks = 0.05 + 0.01 * rng.standard_normal(20)
@@ -212,7 +223,7 @@ def test_no_fix_is_newer_than_its_arrival(
 ) -> None:  # fmt: skip
     """A map between clocks can err, so that a latency by the fixes' own stamps may be below zero; an arrival cannot."""
     shown = profile_of(parabolas(np.array([found_s]), 5e-4), jobs=1)
-    monkeypatch.setattr(sync, "profile_of", lambda replay, jobs: shown)
+    monkeypatch.setattr(sync, "profile_of", lambda replay, jobs, least_sigma_s: shown)
     config = flight.scenario.config
     found = latency_profile(flight.batch, config, flight.facts, by_arrival=by_arrival)
     assert found.status is status, found.reason
