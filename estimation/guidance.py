@@ -113,7 +113,8 @@ def probably_inside(e: Estimate, radius: float, ahead_s: float = 0.0) -> float:
 
 
 def probably_inside_at_contact(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -> float:
-    """Return the probability of standing inside r_land when the descent goes on to the deck and nothing more is seen.
+    """Return the probability of standing inside r_land when the descent goes on to the deck and nothing more is seen:
+    at the approach's rate, as it is flown without sight.
 
     The relative velocity carries the vehicle on until it answers; from then on it closes what it knows to be off.
     What it does not know grows meanwhile (``DeckForecast.apart_at``).
@@ -128,7 +129,7 @@ def probably_inside_at_contact(e: Estimate, forecast: DeckForecast | None, c: La
 
 def keeps_sight(e: Estimate, c: LandingConfig) -> bool:
     """Tell whether a vehicle that goes on down will have the target in view when it has answered, or has met the deck
-    by then. Of a target beside the picture some of the rings are enough.
+    by then. Of a target beside the picture some of the rings are enough (docs/concepts.md, landing modes).
     """
     height = -float(e.deck[2])
     if time_to_contact(height, c) <= c.response_s:
