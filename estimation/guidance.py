@@ -117,25 +117,27 @@ def probably_inside_at_contact(e: Estimate, forecast: DeckForecast | None, c: La
     at the approach's rate, as it is flown without sight.
 
     The relative velocity carries the vehicle on until it answers; from then on it closes what it knows to be off.
-    What it does not know grows meanwhile (``DeckForecast.apart_at``).
+    What it does not know grows meanwhile (``DeckForecast.apart_at``), and it does not follow without error.
     """
     ahead = max(0.0, -float(e.deck[2]) - c.gear_m) / c.approach_rate_mps
     if forecast is None:
         return probably_inside(e, c.r_land_m, ahead)
     carried = min(ahead, c.response_level_s)
     left = (e.deck[:2] + carried * e.deck[3:5]) * math.exp(-c.follow_gain * (ahead - carried))
-    return inside_probability(left, forecast.apart_at(ahead), c.r_land_m)
+    covariance = forecast.apart_at(ahead) + c.follow_sigma_m**2 * np.eye(2)
+    return inside_probability(left, covariance, c.r_land_m)
 
 
-def keeps_sight(e: Estimate, c: LandingConfig) -> bool:
+def keeps_sight(e: Estimate, forecast: DeckForecast | None, c: LandingConfig) -> bool:
     """Tell whether a vehicle that goes on down will have the target in view when it has answered, or has met the deck
     by then. Of a target beside the picture some of the rings are enough (docs/concepts.md, landing modes).
     """
     height = -float(e.deck[2])
-    if time_to_contact(height, c) <= c.response_s:
+    rate = rate_in_sight(height, forecast, c)
+    if height - c.gear_m <= c.response_s * rate:
         return True
     then = e.deck[:2] + c.response_s * e.deck[3:5]
-    lower = height - c.response_s * descent_rate(height, c)
+    lower = height - c.response_s * rate
     return math.hypot(then[0], then[1]) < (math.tan(0.5 * c.field_of_view_rad) + PART_SEEN) * lower
 
 
@@ -243,16 +245,40 @@ def _going_down(seen: Situation, e: Estimate, c: LandingConfig) -> float:
     """Return the rate [m/s] relative to the deck of the last descent now.
 
     Where going on would lose sight of the target the deck's height is kept. Without sight the doubt grows with time,
-    and the rest is gone as fast as may be. In sight it is ``descent_rate``, but no slower than the touchdown's with the
-    1-sigma of the deck's rate: a deck that falls faster than foreseen would keep the vehicle hanging over it.
+    and the rest is gone as fast as may be, after a deck that falls as it must when it has not been met
+    (``falls_faster``). In sight it is ``rate_in_sight``: slower, a deck that falls faster than foreseen would keep the
+    vehicle hanging over it.
     """
     if seen.detection_age_s >= FRESH_S:
-        return c.approach_rate_mps
-    if not keeps_sight(e, c):
+        return c.approach_rate_mps + falls_faster(e, c)
+    if not keeps_sight(e, seen.forecast, c):
         return 0.0
-    unknown = 0.0 if seen.forecast is None else seen.forecast.rate_at(c.response_s)[1]
-    firm = c.touchdown_rate_mps + unknown
-    return min(c.approach_rate_mps, max(firm, descent_rate(-float(e.deck[2]), c)))
+    return rate_in_sight(-float(e.deck[2]), seen.forecast, c)
+
+
+def rate_in_sight(height_m: float, forecast: DeckForecast | None, c: LandingConfig) -> float:
+    """Return the rate [m/s] relative to the deck of the last descent in sight of the target: ``descent_rate``, but no
+    slower than the touchdown's with the 1-sigma of the deck's rate.
+    """
+    unknown = 0.0 if forecast is None else forecast.rate_at(c.response_s)[1]
+    return min(c.approach_rate_mps, max(c.touchdown_rate_mps + unknown, descent_rate(height_m, c)))
+
+
+def falls_faster(e: Estimate, c: LandingConfig) -> float:
+    """Return how much faster [m/s] the deck is to be expected to fall than it is estimated to, for the vehicle is above
+    it still: of a Gaussian gap only the positive part is left, and its mean takes that of the closing rate with it
+    (derived in docs/concepts.md, landing modes). No more than the approach's rate.
+    """
+    from scipy.special import erfcx
+
+    variance = float(e.deck_covariance[2, 2])
+    if variance <= 0.0:
+        return 0.0
+    sigma = math.sqrt(variance)
+    gap = (-float(e.deck[2]) - c.gear_m) / sigma
+    # phi(z) / Phi(z), without the quotient of two small numbers.
+    hazard = math.sqrt(2.0 / math.pi) / float(erfcx(-gap / math.sqrt(2.0)))
+    return min(c.approach_rate_mps, max(0.0, float(e.deck_covariance[2, 5]) / sigma * hazard))
 
 
 def _pressing(p: Progress, seen: Situation, e: Estimate, c: LandingConfig) -> float:

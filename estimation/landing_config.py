@@ -183,6 +183,13 @@ class LandingConfig(Table, frozen=True):
             "1/s",
         ),
     ] = 1.2
+    follow_sigma_m: Annotated[
+        float,
+        not_negative(
+            "1-sigma of the place that the vehicle's own error in following adds until contact, north and east each",
+            "m",
+        ),
+    ] = 0.06
     drift_gain: Annotated[
         float,
         not_negative(

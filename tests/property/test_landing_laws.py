@@ -15,6 +15,7 @@ from estimation.guidance import (
     FRESH_S,
     PRESS_MPS,
     deck_rate_ahead,
+    falls_faster,
     held_up,
     inside_probability,
     keeps_sight,
@@ -112,8 +113,13 @@ def test_no_mission_breaks_the_rules(mode: Mode, descending: bool, mission: list
             # At most 0.5 m/s relative to the deck; where it may stand, to the vehicle, which goes as the deck does.
             pressed = after.met_ns is not None and after.descent_ns is not None
             most = max(C.touchdown_rate_mps, e.velocity_mps[2] + PRESS_MPS) if pressed else -math.inf
-            assert decision.velocity_mps[2] <= max(most, C.approach_rate_mps - rate) + 1e-12
-            if after.descent_ns is not None and seen.detection_age_s < FRESH_S and not keeps_sight(e, C):
+            # Out of sight the deck falls as it must where it has not been met.
+            blind = after.descent_ns is not None and seen.detection_age_s >= FRESH_S
+            falls = falls_faster(e, C) if blind else 0.0
+            assert 0.0 <= falls <= C.approach_rate_mps
+            assert decision.velocity_mps[2] <= max(most, C.approach_rate_mps + falls - rate) + 1e-12
+            pauses = after.descent_ns is not None and not blind and not keeps_sight(e, seen.forecast, C)
+            if pauses:
                 assert decision.velocity_mps[2] <= max(most, -rate) + 1e-12
             if before.mode is Mode.LANDING:
                 risen = before.rose_ns is not None and seen.now_ns - before.rose_ns <= C.lost_s * 1e9

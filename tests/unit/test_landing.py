@@ -15,6 +15,7 @@ from estimation.guidance import (
     FOLLOW_MPS2,
     FRESH_S,
     descent_rate,
+    falls_faster,
     held_up,
     inside_probability,
     keeps_sight,
@@ -214,20 +215,20 @@ def test_the_descent_pauses_where_it_would_lose_sight_of_the_target(
 def test_a_pause_ends_where_the_vehicle_is_carried_over_the_target() -> None:
     c = LandingConfig()
     e = estimate(10**9, (0.3, 0.0, -0.4))
-    assert not keeps_sight(e, c)
+    assert not keeps_sight(e, None, c)
     e.deck[3] = -0.5
-    assert keeps_sight(e, c)
+    assert keeps_sight(e, None, c)
     e.deck[0], e.deck[3] = 0.1, 0.5
-    assert not keeps_sight(e, c)
+    assert not keeps_sight(e, None, c)
 
 
 @pytest.mark.parametrize(
-    ("age_s", "growth_mps", "stays"), [(0.1, 0.6, True), (0.6, 0.6, False), (0.6, 0.25, True)]
+    ("age_s", "growth_mps", "stays"), [(0.1, 0.6, True), (0.6, 0.6, False), (0.6, 0.2, True)]
 )
 def test_without_sight_the_whole_way_to_the_deck_is_judged(
     age_s: float, growth_mps: float, stays: bool
 ) -> None:
-    """0.4 s at the approach's rate: 0.24 m of doubt at contact are too many, 0.1 m are not."""
+    """0.4 s at the approach's rate: 0.24 m of doubt at contact are too many, 0.08 m and the following's own are not."""
     c = LandingConfig()
     e = estimate(10**9, (0.15, 0.0, -0.3))
     told = forecast(10**9, 0.0, growth_mps=growth_mps)
@@ -235,8 +236,28 @@ def test_without_sight_the_whole_way_to_the_deck_is_judged(
     assert (p.descent_ns is not None) == stays
     ahead = (0.3 - c.gear_m) / c.approach_rate_mps
     left = 0.15 * math.exp(-c.follow_gain * (ahead - c.response_level_s))
-    expected = inside_probability(np.array([left, 0.0]), told.apart_at(ahead), c.r_land_m)
+    covariance = told.apart_at(ahead) + c.follow_sigma_m**2 * np.eye(2)
+    expected = inside_probability(np.array([left, 0.0]), covariance, c.r_land_m)
     assert probably_inside_at_contact(e, told, c) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("gap_m", [0.3, 0.05, 0.0, -0.2])
+def test_a_deck_that_has_not_been_met_falls_faster_than_estimated(gap_m: float) -> None:
+    """The mean of what is left of a Gaussian gap and closing rate, where the gap is positive, drawn."""
+    c = LandingConfig()
+    e = estimate(10**9, (0.0, 0.0, -gap_m - c.gear_m), 0.0, down_mps=0.4)
+    e.deck[5] = 0.4
+    e.deck_covariance[2, 2], e.deck_covariance[5, 5] = 0.1**2, 0.25**2
+    e.deck_covariance[2, 5] = e.deck_covariance[5, 2] = 0.8 * 0.1 * 0.25
+    drawn = np.random.default_rng(3).multivariate_normal(
+        e.deck[[2, 5]], e.deck_covariance[np.ix_([2, 5], [2, 5])], 10**6
+    )
+    closing = drawn[drawn[:, 0] < -c.gear_m, 1].mean()
+    assert falls_faster(e, c) == pytest.approx(0.4 - closing, abs=0.003)
+    # Out of sight it is followed.
+    _, said = step(landing(), Situation(10**9, e, 0.6, forecast(10**9, 0.1)), c)
+    if gap_m > -0.2:
+        assert said.velocity_mps[2] == pytest.approx(c.approach_rate_mps - 0.1 + falls_faster(e, c))
 
 
 @pytest.mark.parametrize("age_s", [0.1, 0.6])
