@@ -111,7 +111,9 @@ def free(kind: socket.SocketKind) -> int:
 def read(said: str, log: Path) -> dict[str, Any]:
     """Return the numbers in onboard's last words and in its log."""
     end = re.search(
-        r"median ([\d.]+) ms, p95 ([\d.]+) ms, n (\d+); cpu (\d+) % of a core, resident (\d+) MB", said
+        r"median ([\d.]+) ms, p95 ([\d.]+) ms, largest ([\d.]+) ms, n (\d+); cpu (\d+) % of a core, "
+        r"resident (\d+) MB",
+        said,
     )
     counts = re.search(r"(\d+) estimates, (\d+) images, (\d+) fixes, (\d+) fused, (\d+) LANDING_TARGET", said)
     if end is None or counts is None:
@@ -123,10 +125,12 @@ def read(said: str, log: Path) -> dict[str, Any]:
         if found:
             memory.append((message.log_time_ns * 1e-9, float(found[1])))
     return {
-        "latency_ms": {"median": float(end[1]), "p95": float(end[2]), "n": int(end[3])},
-        "cpu_share": 0.01 * float(end[4]),
+        "latency_ms": {
+            "median": float(end[1]), "p95": float(end[2]), "largest": float(end[3]), "n": int(end[4]),
+        },
+        "cpu_share": 0.01 * float(end[5]),
         "memory_mb": {
-            "end": float(end[5]),
+            "end": float(end[6]),
             "growth_per_30_min": growth(np.array(memory)),
             "every_10_s": [m for _, m in memory],
         },
@@ -155,7 +159,7 @@ def main() -> int:
     latency, memory = found["latency_ms"], found["memory_mb"]
     print(
         f"latency frame to LANDING_TARGET: median {latency['median']:.1f} ms, p95 {latency['p95']:.1f} ms "
-        f"(target {LATENCY_MS:g}), n {latency['n']}"
+        f"(target {LATENCY_MS:g}), largest {latency['largest']:.1f} ms, n {latency['n']}"
     )
     print(f"cpu: {100 * found['cpu_share']:.0f} % of a core (target {100 * CPU_SHARE:g})")
     slope = memory["growth_per_30_min"]

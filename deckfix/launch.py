@@ -7,6 +7,7 @@ import hashlib
 import signal
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -117,8 +118,9 @@ def prepare(options: Options, setup: FlightFile, say: Callable[[str], None]) -> 
         delay = filter_delay(link.vehicle.parameters) if link.vehicle.ardupilot else {}
         facts = Facts(imu_latency_s=float(delay.get("latency_s", 0.0)), vision=options.camera is not None)
         pipeline = Pipeline(
-            setup.config, setup.camera, setup.target, setup.table.detector, options.engine, facts
-        )
+            setup.config, setup.camera, setup.target, setup.table.detector, options.engine, facts,
+            ThreadPoolExecutor(1, "learning"),
+        )  # fmt: skip
         recorder = None
         if path is not None:
             recorder = Recorder(

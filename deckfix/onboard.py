@@ -211,6 +211,8 @@ class Onboard:
             self.recorder.step(self.pipeline.finish())
             self.recorder.say(self.clock(), INFO, self.latency_words())
             self.recorder.close()
+        if self.pipeline.executor is not None:
+            self.pipeline.executor.shutdown()
 
     # -- guidance --------------------------------------------------------------------------------------------------
 
@@ -348,7 +350,10 @@ class Onboard:
         if not taken:
             return "latency frame to LANDING_TARGET: none yet"
         middle, high = np.percentile(taken, [50, 95])
-        return f"latency frame to LANDING_TARGET: median {middle:.1f} ms, p95 {high:.1f} ms, n {len(taken)}"
+        return (
+            f"latency frame to LANDING_TARGET: median {middle:.1f} ms, p95 {high:.1f} ms, largest {max(taken):.1f} ms, "
+            f"n {len(taken)}"
+        )
 
     def _update_status(self, now: int) -> None:
         newest, vehicle = self.newest, self.link.vehicle

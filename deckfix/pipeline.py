@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -108,7 +109,8 @@ class Step:
 class Pipeline:
     """Vision and estimator as one: ``step(event)``.
 
-    ``camera`` and ``target`` are needed for images; without them an image is counted and has no fix. Raises
+    ``camera`` and ``target`` are needed for images; without them an image is counted and has no fix. ``executor`` is
+    where the estimator may learn the platform's motion (``LandingEstimator``). Raises
     ``ConfigError`` for an engine that is not there, ``ValueError`` naming a detector setting that cannot be used.
     """
 
@@ -118,6 +120,7 @@ class Pipeline:
     settings: DetectorSettings = field(default_factory=DetectorSettings)
     engine: EngineName = "auto"
     facts: Facts = field(default_factory=Facts)
+    executor: Executor | None = None
     estimator: LandingEstimator = field(init=False)
     counts: Counter[str] = field(default_factory=Counter)
     """Images, fixes, and images without a fix by reason."""
@@ -130,7 +133,9 @@ class Pipeline:
 
     def __post_init__(self) -> None:
         """Build the estimator and the detector."""
-        self.estimator = LandingEstimator(self.config, engine=self.engine, facts=self.facts)
+        self.estimator = LandingEstimator(
+            self.config, engine=self.engine, facts=self.facts, executor=self.executor
+        )
         self._R_cb = body_to_camera(self.config)
         self._lever_m = np.array(self.config.vision.lever_arm_m)
         if self.camera is not None and self.target is not None:

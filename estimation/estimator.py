@@ -1,11 +1,13 @@
 """The estimator: events in, estimates and fusion records out.
 
 ``step`` takes one event, ``run`` a whole batch; both go through the same code and give the same bits. No clock,
-file, socket or thread is touched: time is what the events say.
+file or socket is touched: time is what the events say. Without an executor of the caller's no thread is either.
 """
 
 from __future__ import annotations
 
+from collections import deque
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -24,7 +26,7 @@ from estimation.frames import Array
 from estimation.heave.model import HeaveModel
 from estimation.history import Engine, History
 from estimation.intake import Intake, latencies_s
-from estimation.learning import MotionLearner
+from estimation.learning import Learned, MotionLearner
 from estimation.ledger import Ledger
 from estimation.outcome import Outcome
 from estimation.output import Facts, Output, Run, columns_of, estimate_at, with_facts
@@ -58,6 +60,7 @@ LOOK_AHEAD_LEARNING = 32
 """The same where the heave is learned on the way."""
 TAKE_UP_NS = 600_000_000
 """How long after its fixes are final a heave model is taken up by the filter."""
+NEVER = int(np.iinfo(np.int64).max)
 
 
 @dataclass(slots=True)
@@ -66,13 +69,16 @@ class LandingEstimator:
 
     ``engine`` is ``"compiled"`` (needs numba), ``"filterpy"`` (the reference, and the one for sensors added with
     ``add_sensor``) or ``"auto"``. ``facts`` are used where the configuration leaves a value open. With ``smooth`` the
-    events are kept, so that ``smoothed`` can go back over them.
+    events are kept, so that ``smoothed`` can go back over them. With an ``executor`` of one worker the platform's
+    motion is learned there, while estimates go on: what is learned is waited for only once it is to be taken up, and
+    all comes out the same to the last bit.
     """
 
     config: Config = field(default_factory=Config)
     engine: EngineName = "auto"
     facts: Facts = field(default_factory=Facts)
     smooth: bool = False
+    executor: Executor | None = None
     layout: Layout = field(init=False)
     engine_name: str = field(init=False)
     _history: History = field(init=False)
@@ -88,6 +94,8 @@ class LandingEstimator:
     _ledger: Ledger = field(default_factory=Ledger)
     _learner: MotionLearner | None = None
     _heave: list[tuple[int, HeaveModel]] = field(default_factory=list)
+    _learning: deque[tuple[int, Future[list[Learned]]]] = field(default_factory=deque)
+    _given_ns: int | None = None
     _utc_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -203,6 +211,7 @@ class LandingEstimator:
             self._not_ready(h.size)
             return
         self._advance()
+        self._catch_up(NEVER)
         self._ledger.keep(h.settle(everything=True))
         rest = h.first(h.size)
         rest.outcome[rest.outcome != Outcome.REJECTED_DUPLICATE] = Outcome.REJECTED_FUTURE
@@ -336,6 +345,8 @@ class LandingEstimator:
         room = int(np.count_nonzero(h.rows.kind[h.done : h.size] == Kind.IMU))
         if room == 0:
             return
+        assert h.newest_ns is not None
+        self._catch_up(h.newest_ns - h.window_ns - TAKE_UP_NS)
         out = Estimates.empty(room, self.layout)
         h.advance(self._engine, out, self._period_ns)
         if out.count:
@@ -347,9 +358,23 @@ class LandingEstimator:
 
     def _learn(self, settled: Rows) -> None:
         """Learn the platform's motion from fixes that are final; the filter takes the result up a fixed time later, so
-        that neither the order of arrival nor the size of a batch shows."""
+        that neither the order of arrival nor the size of a batch shows, nor how long the learning takes."""
         assert self._learner is not None
-        for due_ns, model, changed in self._learner.take(settled):
+        if self.executor is None:
+            self._know(self._learner.take(settled))
+            return
+        # Nothing comes due before what was given last.
+        since = int(settled.t_ns[0]) if self._given_ns is None else self._given_ns
+        self._learning.append((since, self.executor.submit(self._learner.take, settled)))
+        self._given_ns = int(settled.t_ns[-1])
+
+    def _catch_up(self, until_ns: int) -> None:
+        """Know what has been learned aside: what came due by a time, which is waited for, and what is there."""
+        while self._learning and (self._learning[0][0] <= until_ns or self._learning[0][1].done()):
+            self._know(self._learning.popleft()[1].result())
+
+    def _know(self, learned: list[Learned]) -> None:
+        for due_ns, model, changed in learned:
             self._heave.append((due_ns, model))
             for chain, parameters in changed.items():
                 row = Rows.empty(1)
@@ -426,6 +451,7 @@ class LandingEstimator:
         self._new_aligner()
         self._aligner.gyro_bias = bias
         h.newest_ns = None
+        self._given_ns = None
 
     def _clock_went_back(self, t: int) -> bool:
         """Note an inertial sample that is too old; return True, having restarted, when the clock itself went back."""

@@ -58,6 +58,10 @@ SEA_RADPS = (0.44, 5.0)
 """Angular frequencies that a motion without a form of its own is taken to have."""
 
 
+Learned = tuple[int, HeaveModel, dict[int, Array]]
+"""When a fit came due, the heave's model, and the parameters of the chains that change by their first place."""
+
+
 @dataclass(slots=True)
 class MotionLearner:
     """Collects where each fix shows the deck, and fits a model every ``every_s`` to the last ``window_s``.
@@ -90,7 +94,7 @@ class MotionLearner:
         importlib.import_module("scipy.optimize")
         self._prior = self.parameters.copy()
 
-    def take(self, rows: Rows) -> list[tuple[int, HeaveModel, dict[int, Array]]]:
+    def take(self, rows: Rows) -> list[Learned]:
         """Take rows that are final, in order; return for each fit that came due its time, the heave's model and the
         chains that change: by their first place in ``parameters``, their parameters from then on (7,) with the speed
         of the place's drift behind them (8,).
