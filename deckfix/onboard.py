@@ -208,7 +208,10 @@ class Onboard:
         self.link.heartbeat(6, int(self.health.now))  # MAV_STATE_POWEROFF
         self._update_status(self.clock())
         if self.recorder is not None:
-            self.recorder.step(self.pipeline.finish())
+            try:
+                self.recorder.step(self.pipeline.finish())
+            except Exception as error:
+                self._failed(error)
             self.recorder.say(self.clock(), INFO, self.latency_words())
             self.recorder.close()
         if self.pipeline.executor is not None:

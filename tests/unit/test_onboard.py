@@ -22,7 +22,7 @@ from deckfix.dashboard import line, rows
 from deckfix.flight_file import FlightFile, OnboardTable
 from deckfix.launch import Options, fly, prepare
 from deckfix.onboard import Onboard
-from deckfix.pipeline import ImageEvent
+from deckfix.pipeline import ImageEvent, Pipeline, Step
 from deckfix.replaying import replay
 from estimation.config import parse_config
 from estimation.estimator import LandingEstimator
@@ -277,6 +277,24 @@ def test_a_lost_link_stops_what_is_sent_and_is_survived(
             flight.stop.set()
             thread.join(5.0)
     assert not thread.is_alive()
+
+
+def test_what_fails_at_the_end_leaves_the_log_closed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What was being learned beside the estimates may fail only when it is waited for."""
+
+    def finish(pipeline: Pipeline) -> Step:
+        raise ArithmeticError("no such sea")
+
+    monkeypatch.setattr(launch, "warm_estimator", lambda config, engine: None)
+    monkeypatch.setattr(Pipeline, "finish", finish)
+    port, log = free_port(), tmp_path / "flight.mcap"
+    with ScriptedAutopilot(port):
+        options = Options(f"udpin:127.0.0.1:{port}", record=str(log), engine="filterpy")
+        flight = prepare(options, setup(), lambda text: None)
+        fly(flight, 1.0)
+    said = [str(m.decoded.msg) for m in open_flight(log).messages(["/log"])]
+    assert any("internal error: ArithmeticError: no such sea" in s for s in said)
+    assert any("latency" in s for s in said[-1:])
 
 
 def wait(condition: object, seconds: float = 40.0) -> None:
