@@ -6,8 +6,7 @@ file or socket is touched: time is what the events say. Without an executor of t
 
 from __future__ import annotations
 
-from collections import deque
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from estimation.ahead import DeckForecast, DeckForecaster
 from estimation.alignment import Aligner
 from estimation.band import BAND_PARAMETERS
+from estimation.beside import LearnerBeside
 from estimation.clockbank import ClockSummary
 from estimation.config import Config, ConfigError
 from estimation.deck import HEAVE, prior_motion
@@ -26,7 +26,7 @@ from estimation.frames import Array
 from estimation.heave.model import HeaveModel
 from estimation.history import Engine, History
 from estimation.intake import Intake, latencies_s
-from estimation.learning import Learned, MotionLearner
+from estimation.learning import MotionLearner
 from estimation.ledger import Ledger
 from estimation.outcome import Outcome
 from estimation.output import Facts, Output, Run, columns_of, estimate_at, with_facts
@@ -92,10 +92,8 @@ class LandingEstimator:
     _past: list[tuple[int, int]] = field(default_factory=list)
     _estimates: list[Estimates] = field(default_factory=list)
     _ledger: Ledger = field(default_factory=Ledger)
-    _learner: MotionLearner | None = None
+    _learning: LearnerBeside | None = None
     _heave: list[tuple[int, HeaveModel]] = field(default_factory=list)
-    _learning: deque[tuple[int, Future[list[Learned]]]] = field(default_factory=deque)
-    _given_ns: int | None = None
     _utc_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -107,24 +105,25 @@ class LandingEstimator:
         self._period_ns = round(1e9 / c.filter.output_rate_hz) if c.filter.output_rate_hz else 0
         self._intake = Intake(np.round(latencies_s(c, self.facts) * 1e9))
         if c.platform.use is True and c.platform.learn_s > 0.0:
-            self._learner = MotionLearner(
+            learner = MotionLearner(
                 c.platform.learn_s,
                 c.platform.learn_window_s,
                 prior_motion(c.platform),
                 c.imu.accel_noise,
                 c.imu.gyro_noise,
             )
+            self._learning = LearnerBeside(learner, self.executor)
         self._new_aligner()
 
     @property
     def heave_model(self) -> HeaveModel | None:
         """The last heave model that was learned, or None."""
-        return self._learner.model if self._learner is not None else None
+        return self._learning.learner.model if self._learning is not None else None
 
     @property
     def motion(self) -> Array:
         """The parameters of the platform's motion (22,) as learned by now (``platform.motion``)."""
-        known = None if self._learner is None else self._learner.parameters
+        known = None if self._learning is None else self._learning.learner.parameters
         return prior_motion(self.config.platform) if known is None else known.copy()
 
     @property
@@ -201,7 +200,7 @@ class LandingEstimator:
         if self._engine is None or self.layout.offsets[PLATFORM_HEAVE] < 0:
             return None
         s = self._engine.state
-        learned = self._learner is not None and HEAVE in self._learner.blocks
+        learned = self._learning is not None and HEAVE in self._learning.learner.blocks
         return forecaster.forecast(int(s.clock[0]), s.x, s.P, s.motion, learned, self.layout.offsets)
 
     def finish(self) -> None:
@@ -211,7 +210,7 @@ class LandingEstimator:
             self._not_ready(h.size)
             return
         self._advance()
-        self._catch_up(NEVER)
+        self._take_up(NEVER)
         self._ledger.keep(h.settle(everything=True))
         rest = h.first(h.size)
         rest.outcome[rest.outcome != Outcome.REJECTED_DUPLICATE] = Outcome.REJECTED_FUTURE
@@ -286,7 +285,7 @@ class LandingEstimator:
                 i += 1
                 continue
             assert h.newest_ns is not None
-            ahead = LOOK_AHEAD if self._learner is None else LOOK_AHEAD_LEARNING
+            ahead = LOOK_AHEAD if self._learning is None else LOOK_AHEAD_LEARNING
             t = r.t_ns[i : i + ahead]
             imu_here = is_imu[i : i + ahead]
             imu_t = np.where(imu_here, t, np.iinfo(np.int64).min)
@@ -346,35 +345,22 @@ class LandingEstimator:
         if room == 0:
             return
         assert h.newest_ns is not None
-        self._catch_up(h.newest_ns - h.window_ns - TAKE_UP_NS)
+        self._take_up(h.newest_ns - h.window_ns - TAKE_UP_NS)
         out = Estimates.empty(room, self.layout)
         h.advance(self._engine, out, self._period_ns)
         if out.count:
             self._estimates.append(out.filled())
         settled = h.settle()
         self._ledger.keep(settled)
-        if self._learner is not None and len(settled):
-            self._learn(settled)
+        if self._learning is not None and len(settled):
+            self._learning.give(settled)
 
-    def _learn(self, settled: Rows) -> None:
-        """Learn the platform's motion from fixes that are final; the filter takes the result up a fixed time later, so
-        that neither the order of arrival nor the size of a batch shows, nor how long the learning takes."""
-        assert self._learner is not None
-        if self.executor is None:
-            self._know(self._learner.take(settled))
+    def _take_up(self, until_ns: int) -> None:
+        """Let the filter take up what was learned of the platform's motion by a time, and what is there: a fixed time
+        after its fixes were final, so that neither the order of arrival nor the size of a batch shows."""
+        if self._learning is None:
             return
-        # Nothing comes due before what was given last.
-        since = int(settled.t_ns[0]) if self._given_ns is None else self._given_ns
-        self._learning.append((since, self.executor.submit(self._learner.take, settled)))
-        self._given_ns = int(settled.t_ns[-1])
-
-    def _catch_up(self, until_ns: int) -> None:
-        """Know what has been learned aside: what came due by a time, which is waited for, and what is there."""
-        while self._learning and (self._learning[0][0] <= until_ns or self._learning[0][1].done()):
-            self._know(self._learning.popleft()[1].result())
-
-    def _know(self, learned: list[Learned]) -> None:
-        for due_ns, model, changed in learned:
+        for due_ns, model, changed in self._learning.results(until_ns):
             self._heave.append((due_ns, model))
             for chain, parameters in changed.items():
                 row = Rows.empty(1)
@@ -451,7 +437,8 @@ class LandingEstimator:
         self._new_aligner()
         self._aligner.gyro_bias = bias
         h.newest_ns = None
-        self._given_ns = None
+        if self._learning is not None:
+            self._learning.begin_anew()
 
     def _clock_went_back(self, t: int) -> bool:
         """Note an inertial sample that is too old; return True, having restarted, when the clock itself went back."""
