@@ -25,25 +25,26 @@ class LearnerBeside:
 
     learner: MotionLearner
     executor: Executor | None = None
+    _known: deque[Learned] = field(default_factory=deque)
     _going: deque[tuple[int, Future[list[Learned]]]] = field(default_factory=deque)
     _given_ns: int | None = None
 
     def give(self, rows: Rows) -> None:
         """Learn from rows that are final, in order."""
+        if self.executor is None:
+            self._known.extend(self.learner.take(rows))
+            return
         # Nothing comes due before what was given last.
         since = int(rows.t_ns[0]) if self._given_ns is None else self._given_ns
         self._given_ns = int(rows.t_ns[-1])
-        if self.executor is not None:
-            self._going.append((since, self.executor.submit(self.learner.take, rows)))
-            return
-        done: Future[list[Learned]] = Future()
-        done.set_result(self.learner.take(rows))
-        self._going.append((since, done))
+        self._going.append((since, self.executor.submit(self.learner.take, rows)))
 
     def results(self, until_ns: int) -> Iterator[Learned]:
         """Yield what has not been yielded yet: all that came due by a time, which is waited for, and what is there."""
         while self._going and (self._going[0][0] <= until_ns or self._going[0][1].done()):
-            yield from self._going.popleft()[1].result()
+            self._known.extend(self._going.popleft()[1].result())
+        while self._known:
+            yield self._known.popleft()
 
     def begin_anew(self) -> None:
         """Expect times that have gone back; all results were returned before."""
