@@ -256,8 +256,7 @@ def test_a_deck_that_has_not_been_met_falls_faster_than_estimated(gap_m: float) 
     assert falls_faster(e, c) == pytest.approx(0.4 - closing, abs=0.003)
     # Out of sight it is followed.
     _, said = step(landing(), Situation(10**9, e, 0.6, forecast(10**9, 0.1)), c)
-    if gap_m > -0.2:
-        assert said.velocity_mps[2] == pytest.approx(c.approach_rate_mps - 0.1 + falls_faster(e, c))
+    assert said.velocity_mps[2] == pytest.approx(c.approach_rate_mps - 0.1 + falls_faster(e, c))
 
 
 @pytest.mark.parametrize("age_s", [0.1, 0.6])

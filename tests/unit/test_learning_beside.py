@@ -58,7 +58,7 @@ class Late(Executor):
         return Waiting()
 
 
-class Failing(Late):
+class Failing(Executor):
     """Fails at what it is given."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -98,7 +98,7 @@ def all_of(
 
 
 @pytest.mark.parametrize("twice", [False, True])
-def test_what_is_learned_aside_is_the_same_however_long_it_takes(
+def test_what_is_learned_beside_is_the_same_however_long_it_takes(
     flight: SimulatedFlight, twice: bool
 ) -> None:
     events = list(flight.batch)
@@ -132,7 +132,7 @@ def test_nothing_is_waited_for_before_it_is_taken_up(flight: SimulatedFlight) ->
     assert event.stamp_ns - first == pytest.approx(TAKE_UP_NS, abs=50_000_000)
 
 
-def test_what_fails_aside_fails_where_it_is_taken_up(flight: SimulatedFlight) -> None:
+def test_what_fails_beside_fails_where_it_is_taken_up(flight: SimulatedFlight) -> None:
     e = LandingEstimator(flight.scenario.config, "compiled", flight.facts, executor=Failing())
     with pytest.raises(ArithmeticError, match="no such sea"):
         for event in flight.batch:
