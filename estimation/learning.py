@@ -91,7 +91,7 @@ class MotionLearner:
 
     def __post_init__(self) -> None:
         """Keep the prior, and load now what the first fit would stop a flight for."""
-        importlib.import_module("scipy.optimize")
+        importlib.import_module("scipy.linalg")
         self._prior = self.parameters.copy()
 
     def take(self, rows: Rows) -> list[Learned]:

@@ -15,8 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.heave.scoring import Place, descend
+
 Array = NDArray[np.float64]
 
+ITERATIONS, TOLERANCE = 60, 0.01
+"""Steps of the search at most, and the gain below which it ends: of the divergence summed over the frequencies."""
 NARROWEST = 0.02
 """Smallest damping of a section: narrower ones hold on to a phase that a growing swell leaves."""
 
@@ -97,8 +101,6 @@ def fit_band_pass(
     noise: what lies below it is not worth fitting. ``previous`` of the same form is where the search begins.
     Raises ValueError for anything that is not a finite positive density.
     """
-    from scipy.optimize import minimize
-
     frequency = np.asarray(frequency_hz, np.float64)
     density = np.asarray(density_m2ps, np.float64)
     if frequency.ndim != 1 or frequency.shape != density.shape or len(frequency) < 8:
@@ -115,11 +117,14 @@ def fit_band_pass(
     noise = noise_density_m2ps / scale
     low, high = math.log(omega[0]), math.log(omega[-1])
 
-    def objective(x: Array) -> tuple[float, Array]:
+    def evaluate(x: Array) -> Place[tuple[Array, Array]]:
         model, gradient = _density(omega, x, order)
         ratio = (wanted + noise) / (model + noise)
-        value = float(np.mean(ratio - 1.0 - np.log(ratio)))
-        return value, gradient @ ((1.0 - ratio) / (model + noise)) / len(omega)
+        return Place(x, float(np.sum(ratio - 1.0 - np.log(ratio))), (ratio, gradient / (model + noise)))
+
+    def derivatives(place: Place[tuple[Array, Array]]) -> tuple[Array, Array]:
+        ratio, by_log = place.state
+        return by_log @ (1.0 - ratio), by_log @ by_log.T
 
     starts = _starts(omega, wanted, order)
     if previous is not None and [len(o) for o in _grouped(previous)] == order:
@@ -129,22 +134,18 @@ def fit_band_pass(
         bounds += (
             [(-40.0, 40.0)] + [(low, high)] * sections + [(math.log(NARROWEST), math.log(2.0))] * sections
         )
-    limits = np.array(bounds).T
+    least, most = np.array(bounds).T
     best = min(
         (
-            minimize(
-                objective,
-                np.clip(s, *limits),
-                jac=True,
-                method="L-BFGS-B",
-                bounds=bounds,
-                options={"maxiter": 150},
-            )
+            descend(
+                evaluate, derivatives, evaluate(np.clip(s, least, most)), least, most,
+                iterations=ITERATIONS, tolerance=TOLERANCE,
+            )[0]
             for s in starts
         ),
-        key=lambda r: float(r.fun),
-    )
-    return _assemble(best.x, order, scale, float(best.fun))
+        key=lambda place: place.value,
+    )  # fmt: skip
+    return _assemble(best.x, order, scale, best.value / len(omega))
 
 
 def _density(omega: Array, x: Array, order: list[int]) -> tuple[Array, Array]:

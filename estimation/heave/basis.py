@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,24 +32,41 @@ class Basis:
 
     def values(self, t_s: Array) -> Array:
         """Columns at times ``t_s`` (n,): (n, size)."""
-        angle = 2.0 * np.pi * np.outer(t_s, self.frequency_hz)
+        turned = phasors(t_s, self.frequency_hz)
         rate, scale = self._drift()
         drift = scale * np.sin(np.outer(t_s - self.drift_start_s, rate))
-        return np.hstack([np.cos(angle), np.sin(angle), np.ones((len(t_s), 1)), drift])
+        return np.hstack([turned.real, turned.imag, np.ones((len(t_s), 1)), drift])
 
     def rates(self, t_s: Array) -> Array:
         """Time derivatives of the columns at ``t_s`` (n,): (n, size) [1/s]."""
         omega = 2.0 * np.pi * self.frequency_hz
-        angle = np.outer(t_s, omega)
+        turned = omega * phasors(t_s, self.frequency_hz)
         rate, scale = self._drift()
         drift = scale * rate * np.cos(np.outer(t_s - self.drift_start_s, rate))
-        return np.hstack([-omega * np.sin(angle), omega * np.cos(angle), np.zeros((len(t_s), 1)), drift])
+        return np.hstack([-turned.imag, turned.real, np.zeros((len(t_s), 1)), drift])
 
     def _drift(self) -> tuple[Array, Array]:
         """Angular rates and scales of the drift columns."""
         order = np.asarray(np.arange(1, self.drift_count + 1) - 0.5, np.float64) * np.pi
         scale: Array = np.sqrt(2.0 * self.drift_span_s) / order
         return order / self.drift_span_s, scale
+
+
+def phasors(t_s: Array, frequency_hz: Array) -> NDArray[np.complex128]:
+    """Return exp(2 pi i f t) for times (n,) [s] and frequencies (m,) [Hz]: (n, m).
+
+    Of evenly spaced frequencies every one is the product of a coarse and a fine one, which spares most of the sines.
+    """
+    m = len(frequency_hz)
+    step = float(frequency_hz[-1] - frequency_hz[0]) / (m - 1) if m > 1 else 0.0
+    even = m > 1 and np.allclose(frequency_hz, frequency_hz[0] + step * np.arange(m), rtol=1e-12, atol=0.0)
+    if not even:
+        return np.asarray(np.exp(2j * np.pi * np.outer(t_s, frequency_hz)))
+    each = math.ceil(math.sqrt(m))
+    coarse = np.exp(2j * np.pi * np.outer(t_s, frequency_hz[::each]))
+    fine = np.exp(2j * np.pi * np.outer(t_s, step * np.arange(each)))
+    out = (coarse[:, :, None] * fine[:, None, :]).reshape(len(t_s), -1)[:, :m]
+    return np.asarray(out)
 
 
 def dense_basis(

@@ -340,7 +340,10 @@ def _of_spectrum(window: Window, learned: LearnedSpectrum, settings: SpectrumSet
     harmonics = learned.mean.copy()
     harmonics[2 * len(omega) :] = 0.0
     time = np.linspace(-window.span_s, 0.0, max(16, int(4.0 * window.span_s)))
-    heave, rate = learned.basis.values(time) @ harmonics, learned.basis.rates(time) @ harmonics
+    columns, m = learned.basis.values(time), len(omega)
+    cosine, sine = harmonics[:m], harmonics[m : 2 * m]
+    heave = columns @ harmonics
+    rate = columns[:, : 2 * m] @ np.concatenate([omega * sine, -omega * cosine])
     return Coefficients(
         learned.basis,
         learned.mean,

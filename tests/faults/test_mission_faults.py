@@ -135,7 +135,7 @@ def test_whatever_misleads_it_never_touches_down_beside_the_deck(mishap: Mishap,
 @pytest.mark.parametrize(
     ("seed", "detector_s"),
     [
-        pytest.param(seed, detector_s, marks=[] if (seed, detector_s) == (3, 2.5) else pytest.mark.nightly)
+        pytest.param(seed, detector_s, marks=[] if (seed, detector_s) == (1, 2.5) else pytest.mark.nightly)
         for seed in range(1, 9)
         for detector_s in (1.0, 2.5, 5.0)
     ],
@@ -143,11 +143,17 @@ def test_whatever_misleads_it_never_touches_down_beside_the_deck(mishap: Mishap,
 def test_what_stands_stays_until_a_slow_landing_detector_tells(
     monkeypatch: pytest.MonkeyPatch, seed: int, detector_s: float
 ) -> None:
-    """In a swell, on a deck that falls away and comes up again under the vehicle while the target is out of sight."""
+    """In a swell, on a deck that falls away and comes up again under the vehicle while the target is out of sight. What
+    a rising deck touches while it is led up does not stand: it goes on up, and comes again.
+    """
     monkeypatch.setattr(world, "LEGS_LOADED_S", detector_s)
     swell = WavesTable(beaufort=3, waves=(Wave("swell", 0.4, 9.0, 0.2, 0.1),))
     flown = fly(msgspec.structs.replace(mission(), sea=swell), seed)
     assert flown.contact is not None
+    if not flown.contact.descending:
+        on_the_deck_or_not_at_all(flown)
+        assert flown.end == "landed"
+        return
     after = [(mode, reason) for t, mode, reason in flown.transitions if t > flown.contact.t_s]
     assert after == [(Mode.LANDED, Reason.CONTACT)]
     assert flown.transitions[-1][0] - flown.contact.t_s >= detector_s
