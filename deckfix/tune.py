@@ -68,7 +68,7 @@ class _Replays:
     parameters: list[Parameter]
     options: TuneOptions
     state: Path
-    known: dict[str, float] = field(default_factory=dict)
+    known: dict[str, list[float]] = field(default_factory=dict)
 
     def trial(self, path: str, values: tuple[tuple[str, float], ...]) -> Trial:
         return Trial(path, self.base, values, self.options.engine, self.options.truth_weight)
@@ -83,8 +83,8 @@ class _Replays:
 
     def objective(
         self, fixed: tuple[tuple[str, float], ...], free: list[str], points: Sequence[Array]
-    ) -> list[float]:
-        """Return minus the log-likelihood of all flights at points of the free parameters' logarithms."""
+    ) -> list[Array]:
+        """Return the log-likelihoods of the parts of all flights at points of the free parameters' logarithms."""
         trials, names = list[Trial](), list[list[str]]()
         for point in points:
             values = (*fixed, *zip(free, np.exp(point).tolist(), strict=True))
@@ -100,10 +100,10 @@ class _Replays:
             for index, answer in self.workers.each(score, [unique[n] for n in missing]):
                 if not isinstance(answer, Score):
                     raise InputError(answer.reason if isinstance(answer, Refused) else str(answer))
-                self.known[missing[index]] = answer.log_likelihood
-                file.write(json.dumps([missing[index], answer.log_likelihood]) + "\n")
+                self.known[missing[index]] = list(answer.parts)
+                file.write(json.dumps([missing[index], answer.parts]) + "\n")
                 file.flush()
-        return [-sum(self.known[n] for n in each) for each in names]
+        return [np.concatenate([self.known[n] for n in each]) for each in names]
 
 
 def run_tune(
@@ -176,7 +176,7 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
         fixed = tuple((p.name, p.start) for k, p in enumerate(parameters) if k not in free)
         names = [parameters[k].name for k in free]
 
-        def objective(points: Sequence[Array], fixed: Any = fixed, names: list[str] = names) -> list[float]:
+        def objective(points: Sequence[Array], fixed: Any = fixed, names: list[str] = names) -> list[Array]:
             return replays.objective(fixed, names, points)
 
         search = Search(objective, lower[free], upper[free], centre[free])
@@ -292,7 +292,7 @@ def _resume(replays: _Replays, hashes: list[str], remarks: list[str]) -> None:
                 name, value = json.loads(line)
             except ValueError:
                 continue  # the line that was being written
-            replays.known[str(name)] = float(value)
+            replays.known[str(name)] = [float(v) for v in value]
         remarks.append(f"taking up an interrupted tuning: {len(replays.known)} replays are known")
     elif lines and not o.force:
         raise OutputError(

@@ -56,6 +56,8 @@ WIDTHS: dict[Kind, float] = {
 """w: how far a faulty reading may be off [m, m/s, rad], in each of its components."""
 TRUTH_EVERY_NS = 5_000_000_000
 """Errors of the estimate are correlated over seconds: nearer instants would count one error several times."""
+PARTS = 200
+"""Into so many parts of as many measurements a flight is divided, where it has as many."""
 KEY_DTYPE = np.dtype([("stamp_ns", "i8"), ("sensor", "i2")])
 """What tells measurements of a flight apart."""
 
@@ -85,9 +87,11 @@ class SensorScore:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What a trial gave: the log-likelihood (truth included, weighted), the truth's part, and each sensor's."""
+    """What a trial gave: the log-likelihood (truth included, weighted), that of short parts of the flight, one after
+    the other, which add up to it, the truth's, and each sensor's."""
 
     log_likelihood: float
+    parts: tuple[float, ...]
     truth: float | None
     sensors: dict[str, SensorScore]
 
@@ -224,11 +228,12 @@ def _scored(run: Run, flight: _Flight, config: Config, truth_weight: float) -> S
             kind = Kind(int(flight.kinds[mine][0]))
             count = int(np.count_nonzero(mine))
             sensors[name] = SensorScore(kind, count, ratio, rejected, float(value[mine].sum()))
-    total, truth = float(value.sum()), None
+    begins = np.unique(np.arange(PARTS) * len(value) // PARTS)
+    parts, truth = np.add.reduceat(value, begins).tolist(), None
     if truth_weight > 0.0 and flight.truth is not None:
         truth = _truth(run, flight.truth, config.filter.huber_sigma)
-        total += truth_weight * truth
-    return Score(total, truth, sensors)
+        parts.append(truth_weight * truth)
+    return Score(sum(parts), tuple(parts), truth, sensors)
 
 
 def _truth(run: Run, truth: Trajectory, huber_sigma: float) -> float:

@@ -1,10 +1,12 @@
 """The search for the best parameters, and what it says of how well they are known.
 
 All in the logarithms of the parameters. A first sweep takes one parameter after the other to the best of a few factors,
-since far from the truth the likelihood can be flat (a noise below what the receiver states has no effect). SciPy's
-L-BFGS-B goes on from there within the bounds, with differences of the objective as derivatives, each parameter in units
-of its own curvature, which is taken anew on the way. At the end the Hessian H by central differences gives a Newton
-step, where that is better, and the covariance H^-1 of the logarithms (Bar-Shalom, Li and Kirubarajan, 2001, 2.4).
+since far from the truth the likelihood can be flat (a noise below what the receiver states has no effect). A damped
+Newton search goes on from there within the bounds (``estimation.heave.scoring``), with central differences of the
+likelihood of many short parts of the flights: their sum gives gradient and curvature of each parameter, the products
+of the parts' slopes how parameters answer to each other (Berndt, Hall, Hall and Hausman, 1974). At the end the Hessian
+H by central differences gives a Newton step, where that is better, and the covariance H^-1 of the logarithms
+(Bar-Shalom, Li and Kirubarajan, 2001, 2.4).
 
 A weak prior (a factor of ``PRIOR`` is one sigma about the start) belongs to the objective: it decides nothing that the
 flights tell of, and keeps what they say nothing of.
@@ -20,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.frames import Array
+from estimation.heave.scoring import Place, descend
 
 PRIOR = 30.0
 SWEEP = (1.0 / 10.0, 1.0 / math.sqrt(10.0), math.sqrt(10.0), 10.0)
@@ -28,15 +31,17 @@ STEP = 0.05
 LEAST_STEP, LARGEST_STEP = 0.02, 0.3
 """Steps of the Hessian: about one sigma, within these."""
 AT_BOUND = 0.01
-ITERATIONS, LEGS, WORTH = 12, 6, 0.5
-"""Iterations of L-BFGS-B between which curvatures are taken anew, how often, and the gain below which it ends."""
+ITERATIONS, WORTH = 30, 0.5
+"""Steps of the search at most, and the gain below which it ends."""
+CORRELATED = 0.95
+"""Largest correlation of two parameters that is taken from the slopes."""
 EDGE = 5.0
 """What putting one parameter back that is not identified may cost, before the others are searched for again."""
 KNOWN = math.log(3.0) / 1.96
 """A parameter is identified where its 95 % interval is within a factor of three of it."""
 
-Objective = Callable[[Sequence[Array]], list[float]]
-"""Minus log-likelihood at points of log-parameters, the prior left out."""
+Objective = Callable[[Sequence[Array]], list[Array]]
+"""Log-likelihoods (b,) of the parts of all flights at each of some points of log-parameters, the prior left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,54 +95,68 @@ class Search:
     centre: Array
     evaluations: int = 0
 
-    def values(self, points: Sequence[Array]) -> Array:
-        """Return the objective with its prior at points within the bounds."""
+    def parts(self, points: Sequence[Array]) -> Array:
+        """Return the log-likelihoods of the parts at points within the bounds (n, b)."""
         self.evaluations += len(points)
-        prior = [0.5 * float(np.sum((p - self.centre) ** 2)) / math.log(PRIOR) ** 2 for p in points]
-        out: Array = np.array(self.objective(points)) + np.array(prior)
-        return out
+        return np.array(self.objective(points))
+
+    def values(self, points: Sequence[Array]) -> Array:
+        """Return the objective, minus the log-likelihood with its prior, at points within the bounds."""
+        return self._objective(points, self.parts(points))
 
     def run(self, start: Array, sweep: bool = True) -> Found:
         """Return where the search from a start ends."""
         before = self.evaluations
         point = np.clip(start, self.lower, self.upper)
-        value = float(self.values([point])[0])
         if sweep:
-            point, value = self._swept(point, value)
-        best = Found(point, value, 0)
-        for _ in range(LEGS):
-            leg = self._leg(best)
-            gained, best = best.value - leg.value, leg
-            if gained < WORTH:
-                break
-        return Found(best.point, best.value, self.evaluations - before)
+            point = self._swept(point)
 
-    def _leg(self, start: Found) -> Found:
-        """Return where some iterations of L-BFGS-B lead to, each parameter in units of its curvature at the start."""
-        from scipy.optimize import minimize
+        def evaluate(x: Array) -> Place[Array]:
+            parts = self.parts([x])
+            return Place(x, float(self._objective([x], parts)[0]), parts[0])
 
-        best, steps = start, np.full(len(start.point), STEP)
-        _, curvature = self._derivatives(start.point, start.value, steps)
-        unit = 1.0 / np.sqrt(np.clip(curvature, 1.0, 1e6))
+        end, _ = descend(
+            evaluate, self._slopes, evaluate(point), self.lower, self.upper, iterations=ITERATIONS, tolerance=WORTH
+        )  # fmt: skip
+        return Found(end.x, end.value, self.evaluations - before)
 
-        def scaled(y: Array) -> tuple[float, Array]:
-            nonlocal best
-            x = np.clip(y * unit, self.lower, self.upper)
-            steps = np.where(x + STEP <= self.upper, STEP, -STEP)
-            all_values = self.values([x, *(x + s * e for s, e in zip(steps, np.eye(len(x)), strict=True))])
-            if all_values[0] < best.value:
-                best = Found(x, float(all_values[0]), 0)
-            return float(all_values[0]), (all_values[1:] - all_values[0]) / steps * unit
+    def _objective(self, points: Sequence[Array], parts: Array) -> Array:
+        prior = [0.5 * float(np.sum((p - self.centre) ** 2)) / math.log(PRIOR) ** 2 for p in points]
+        out: Array = np.array(prior) - parts.sum(axis=1)
+        return out
 
-        minimize(
-            scaled,
-            start.point / unit,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=list(zip(self.lower / unit, self.upper / unit, strict=True)),
-            options={"maxiter": ITERATIONS, "ftol": 1e-7, "gtol": 0.05, "maxls": 10},
+    def _slopes(self, place: Place[Array]) -> tuple[Array, Array]:
+        """Return gradient (p,) and curvature (p, p) of the objective, by differences as far apart as the bounds allow.
+
+        The diagonal of the curvature is that of the differences where it is positive, else of the slopes' squares.
+        """
+        n = len(place.x)
+        down, up = np.maximum(place.x - STEP, self.lower), np.minimum(place.x + STEP, self.upper)
+        points = [_moved(place.x, k, to[k] - place.x[k]) for k in range(n) for to in (down, up)]
+        parts = self.parts(points).reshape(n, 2, -1)
+        before, after = (place.x - down)[:, None], (up - place.x)[:, None]
+        falling = np.divide(
+            place.state - parts[:, 0], before, out=np.zeros_like(parts[:, 0]), where=before > 0.0
         )
-        return best
+        rising = np.divide(
+            parts[:, 1] - place.state, after, out=np.zeros_like(parts[:, 0]), where=after > 0.0
+        )
+        # At a bound only one of the two is there.
+        one_sided = np.where(before > 0.0, falling, rising)
+        both = (falling * after + rising * before) / (before + after)
+        slope = np.where((before > 0.0) & (after > 0.0), both, one_sided)
+        product = slope @ slope.T
+        squares = np.diag(product)
+        size = np.sqrt(np.maximum(np.outer(squares, squares), 1e-300))
+        correlation = np.clip(product / size, -CORRELATED, CORRELATED)
+        np.fill_diagonal(correlation, 1.0)
+        bend = -2.0 * (rising - falling).sum(axis=1) / (before + after)[:, 0]
+        inside = (before > 0.0)[:, 0] & (after > 0.0)[:, 0]
+        curvature = np.where(inside & (bend > 0.0), bend, squares)
+        root = np.sqrt(curvature)
+        prior = 1.0 / math.log(PRIOR) ** 2
+        gradient = prior * (place.x - self.centre) - slope.sum(axis=1)
+        return gradient, correlation * np.outer(root, root) + prior * np.eye(n)
 
     def certainty(self, found: Found) -> tuple[Found, Certainty]:
         """Return what a Newton step from the end of a search gives, where it is better, and how certain it is."""
@@ -161,7 +180,8 @@ class Search:
         better = Found(y, value, self.evaluations) if value < found.value else found
         return better, Certainty(_sigmas(information, ~at_bound), at_bound, information)
 
-    def _swept(self, point: Array, value: float) -> tuple[Array, float]:
+    def _swept(self, point: Array) -> Array:
+        value = float(self.values([point])[0])
         for k in range(len(point)):
             tried = []
             for factor in SWEEP:
@@ -172,7 +192,7 @@ class Search:
             best = int(np.argmin(values))
             if values[best] < value:
                 point, value = tried[best], float(values[best])
-        return point, value
+        return point
 
     def _derivatives(
         self, x: Array, value: float, steps: Array, which: NDArray[np.int64] | None = None

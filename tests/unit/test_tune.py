@@ -14,12 +14,13 @@ from deckfix import tune as tune_module
 from deckfix.cli import main
 from deckfix.files import InputError, OutputError
 from deckfix.tune import STATE, TuneOptions, run_tune
-from deckfix.tune_objective import FAULTY, Refused, Score, Trial, density, score
+from deckfix.tune_objective import FAULTY, PARTS, Refused, Score, Trial, density, score
 from deckfix.tune_parameters import DEFAULTS, choose, factor_in_words, with_values
 from deckfix.tune_search import Search
 from estimation.config import Config, dump_config, load_config, parse_config
 from estimation.events import Event, EventBatch, GpsVelocity, Kind
 from estimation.frames import Array
+from estimation.heave.scoring import Place
 from logs.events import series_of_batch
 from logs.writer import FlightWriter
 
@@ -285,20 +286,24 @@ def test_the_truth_counts_where_it_is_asked_for(flights: list[str]) -> None:
     assert isinstance(with_truth, Score)
     assert without.truth is None
     assert with_truth.truth is not None
+    assert sum(with_truth.parts) == pytest.approx(with_truth.log_likelihood)
+    assert with_truth.parts[:-1] == without.parts
+    assert len(without.parts) == PARTS
     assert with_truth.log_likelihood == pytest.approx(without.log_likelihood + 2.0 * with_truth.truth)
 
 
 def test_the_search_finds_noises_and_how_certain_they_are() -> None:
     rng = np.random.default_rng(3)
     true, n = np.array([0.02, 5.0]), 400
-    squares = [float(np.mean((s * rng.standard_normal(n)) ** 2)) for s in true]
+    drawn = (true[:, None] * rng.standard_normal((2, n))) ** 2
+    squares = drawn.mean(axis=1)
     calls = 0
 
-    def objective(points: Sequence[Array]) -> list[float]:
+    def objective(points: Sequence[Array]) -> list[Array]:
         nonlocal calls
         calls += len(points)
         # Two samples of white noise, and a parameter that nothing depends on.
-        return [sum(n * p[k] + 0.5 * n * squares[k] * np.exp(-2.0 * p[k]) for k in range(2)) for p in points]
+        return [np.hstack([-p[k] - 0.5 * drawn[k] * np.exp(-2.0 * p[k]) for k in range(2)]) for p in points]
 
     start = np.log([0.2, 0.5, 1.0])
     search = Search(objective, start - np.log(100.0), start + np.log(100.0), start)
@@ -314,8 +319,8 @@ def test_what_is_put_back_moves_the_others_as_the_hessian_says() -> None:
     H = np.array([[200.0, 3.0, 0.0], [3.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
     best = np.array([1.0, 0.4, 0.0])
 
-    def objective(points: Sequence[Array]) -> list[float]:
-        return [0.5 * float((p - best) @ H @ (p - best)) for p in points]
+    def objective(points: Sequence[Array]) -> list[Array]:
+        return [-0.5 * (p - best) * (H @ (p - best)) for p in points]
 
     search = Search(objective, np.full(3, -3.0), np.full(3, 3.0), np.zeros(3))
     found, certainty = search.certainty(search.run(np.zeros(3)))
@@ -327,11 +332,45 @@ def test_what_is_put_back_moves_the_others_as_the_hessian_says() -> None:
 
 
 def test_a_parameter_at_its_bound_is_said_to_be_there() -> None:
-    def objective(points: Sequence[Array]) -> list[float]:
-        return [100.0 * float((p[0] - 5.0) ** 2 + p[1] ** 2) for p in points]
+    def objective(points: Sequence[Array]) -> list[Array]:
+        return [-100.0 * np.array([(p[0] - 5.0) ** 2, p[1] ** 2]) for p in points]
 
     search = Search(objective, np.full(2, -1.0), np.full(2, 1.0), np.zeros(2))
     found, certainty = search.certainty(search.run(np.array([0.0, 0.5])))
     assert certainty.at_bound.tolist() == [True, False]
     assert certainty.identified.tolist() == [False, True]
     assert found.point == pytest.approx([1.0, 0.0], abs=0.02)
+
+
+@pytest.mark.parametrize("place", [[0.3, -0.2], [1.0, -0.2], [0.3, -1.0], [1.0, -1.0]])
+def test_slopes_are_those_of_the_likelihood_also_on_a_bound(place: list[float]) -> None:
+    """Two noises seen together and apart: their slopes and how they answer to each other, against the formulas."""
+    rng = np.random.default_rng(4)
+    n = 20000
+    w = rng.standard_normal((3, n))
+    squares = [w[0] ** 2, w[1] ** 2, (w[0] + w[1]) ** 2]
+
+    def variances(p: Array) -> list[Array]:
+        a, b = np.exp(2.0 * p[0]), np.exp(2.0 * p[1])
+        return [a, b, a + b]
+
+    def objective(points: Sequence[Array]) -> list[Array]:
+        return [
+            np.sum(
+                [-0.5 * np.log(v) - 0.5 * s / v for v, s in zip(variances(p), squares, strict=True)], axis=0
+            )
+            for p in points
+        ]
+
+    search = Search(objective, np.full(2, -1.0), np.full(2, 1.0), np.zeros(2))
+    x = np.array(place)
+    gradient, H = search._slopes(Place(x, 0.0, objective([x])[0]))
+    step = 1e-5 * np.eye(2)
+    wanted = [-(objective([x + s])[0].sum() - objective([x - s])[0].sum()) / 2e-5 for s in step]
+    prior = x / np.log(30.0) ** 2
+    inside = np.abs(x) < 1.0
+    np.testing.assert_allclose(gradient[inside], (np.array(wanted) + prior)[inside], rtol=0.02)
+    # One-sided differences see half a step of the curvature besides.
+    np.testing.assert_allclose(gradient, np.array(wanted) + prior, atol=0.03 * float(np.diag(H).max()))
+    assert H[0, 1] == H[1, 0]
+    assert np.linalg.eigvalsh(H)[0] > 0.0
