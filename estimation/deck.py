@@ -85,6 +85,12 @@ def any_sea(sigma_m: float, omega_radps: float, damping: float) -> Array:
     return band
 
 
+def has_form(band: Array) -> bool:
+    """Tell whether a chain's parameters (7,) have a form of their own, and are not those of ``any_sea``."""
+    omega = band[1:4] / ANY_SEA
+    return not (np.allclose(omega, omega[0], rtol=1e-9, atol=0.0) and np.all(band[4:] == band[4]))
+
+
 def places(chain: int, offsets: Offsets) -> tuple[int, int]:
     """Return where the states of the chain whose parameters begin at ``chain`` begin: nominal state, error state."""
     if chain == HEAVE:

@@ -19,7 +19,7 @@ from estimation.band import BAND_PARAMETERS
 from estimation.beside import LearnerBeside
 from estimation.clockbank import ClockSummary
 from estimation.config import Config, ConfigError
-from estimation.deck import HEAVE, prior_motion
+from estimation.deck import HEAVE, has_form, prior_motion
 from estimation.events import Event, EventBatch, Kind
 from estimation.filter import Model
 from estimation.frames import Array
@@ -196,11 +196,17 @@ class LandingEstimator:
         return int(h.rows.t_ns[found[-1]]) if len(found) else None
 
     def deck_forecast(self, forecaster: DeckForecaster) -> DeckForecast | None:
-        """Return the deck ahead of the newest estimate, or None before the start and where the platform is off."""
+        """Return the deck ahead of the newest estimate, or None before the start and where the platform is off.
+
+        It tells a sea as learned once the filter has taken it up in its form.
+        """
         if self._engine is None or self.layout.offsets[PLATFORM_HEAVE] < 0:
             return None
         s = self._engine.state
-        learned = self._learning is not None and HEAVE in self._learning.learner.blocks
+        band, known = s.motion[HEAVE : HEAVE + BAND_PARAMETERS], self.config.platform.motion
+        learned = has_form(band) and (
+            known is None or tuple(band) != tuple(known[HEAVE : HEAVE + BAND_PARAMETERS])
+        )
         return forecaster.forecast(int(s.clock[0]), s.x, s.P, s.motion, learned, self.layout.offsets)
 
     def finish(self) -> None:

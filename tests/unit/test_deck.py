@@ -24,9 +24,11 @@ from estimation.config import parse_config
 from estimation.deck import (
     CHAINS,
     HEAVE,
+    any_sea,
     change_motion,
     deck_output,
     deck_transition,
+    has_form,
     kept_step,
     no_steps,
     places,
@@ -271,3 +273,13 @@ def test_a_step_that_is_remembered_is_that_of_its_length_and_motion() -> None:
                 assert np.array_equal(kept[k, 0, c], transition)
                 assert np.array_equal(kept[k, 1, c], noise)
     assert np.count_nonzero(keys[:, 0]) == 2
+
+
+def test_a_chain_has_a_form_unless_it_is_that_of_any_sea() -> None:
+    broad = any_sea(0.2, 1.7, 0.3)
+    assert not has_form(broad)
+    assert not has_form(any_sea(0.02, 4.9, 0.1))
+    for k in range(1, 7):
+        own = broad.copy()
+        own[k] *= 1.01
+        assert has_form(own)

@@ -7,10 +7,13 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from msgspec.structs import replace as changed
 
+from estimation.ahead import DeckForecaster
 from estimation.config import Config
+from estimation.deck import prior_motion
 from estimation.estimator import TAKE_UP_NS, LandingEstimator
 from estimation.events import Event, Imu
 from simulation.flight import SimulatedFlight, parse_scenario, simulate
@@ -38,6 +41,9 @@ vision = { rate_hz = 20.0, delay_s = 0.06 }
 use = true
 learn_s = 1.0
 """
+
+
+MOTION = prior_motion(parse_scenario(FLIGHT).config.platform)
 
 
 class Late(Executor):
@@ -83,15 +89,19 @@ def again(events: list[Event]) -> Iterator[Event]:
 def all_of(
     flight: SimulatedFlight, events: Iterator[Event], executor: Executor | None, config: Config | None = None
 ) -> tuple[list[bytes], bytes]:
-    """Every estimate as it came out, and the records with the notes."""
+    """Every estimate as it came out, with what is said of the deck's sea then, and the records with the notes."""
     e = LandingEstimator(config or flight.scenario.config, "compiled", flight.facts, executor=executor)
     estimates, records = [], b""
+    forecaster = DeckForecaster.at(np.array([0.0, 1.0]))
     for event in events:
         output = e.step(event)
         records += output.records.tobytes()
         if output.estimate is not None:
             x = output.estimate
-            estimates.append(x.nominal.tobytes() + x.covariance.tobytes() + x.deck.tobytes())
+            ahead = e.deck_forecast(forecaster)
+            assert ahead is not None
+            said = np.array([ahead.learned, *ahead.skill])
+            estimates.append(x.nominal.tobytes() + x.covariance.tobytes() + x.deck.tobytes() + said.tobytes())
     output = e.settled()
     notes = "\n".join(str(note) for note in output.notes)
     return estimates, records + output.records.tobytes() + notes.encode()
@@ -113,6 +123,25 @@ def test_what_is_learned_beside_is_the_same_however_long_it_takes(
     config = flight.scenario.config
     blind = changed(config, platform=changed(config.platform, learn_s=0.0))
     assert all_of(flight, flown(events), None, blind)[0] != wanted[0]
+
+
+def test_a_sea_is_told_as_learned_once_it_is_taken_up(flight: SimulatedFlight) -> None:
+    e = LandingEstimator(flight.scenario.config, "compiled", flight.facts)
+    forecaster = DeckForecaster.at(np.array([0.0, 1.0]))
+    found = told = None
+    for event in flight.batch:
+        e.step(event)
+        if not isinstance(event, Imu):
+            continue
+        if found is None and e.heave_model is not None and not np.array_equal(e.motion, MOTION):
+            found = event.stamp_ns
+        ahead = e.deck_forecast(forecaster)
+        if ahead is not None and ahead.learned:
+            told = event.stamp_ns
+            break
+    assert found is not None
+    assert told is not None
+    assert told - found >= TAKE_UP_NS - 50_000_000
 
 
 def test_nothing_is_waited_for_before_it_is_taken_up(flight: SimulatedFlight) -> None:
