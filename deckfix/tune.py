@@ -23,7 +23,7 @@ from deckfix.files import InputError, OutputError, check_output, existing
 from deckfix.parallel import WorkerLost, Workers
 from deckfix.replaying import configuration
 from deckfix.terminal import printable, working
-from deckfix.tune_objective import Refused, Score, Trial, score
+from deckfix.tune_objective import PARTS, Refused, Score, Trial, score
 from deckfix.tune_parameters import Parameter, choose, with_values
 from deckfix.tune_report import Tuned, TunedFlight, provenance, report
 from deckfix.tune_search import EDGE, Certainty, Found, Search
@@ -280,7 +280,7 @@ def _resume(replays: _Replays, hashes: list[str], remarks: list[str]) -> None:
     Raises ``OutputError`` where the file is of another tuning and may not be overwritten.
     """
     o = replays.options
-    told = json.dumps([__version__, replays.base, hashes, o.truth_weight, o.engine])
+    told = json.dumps([__version__, PARTS, replays.base, hashes, o.truth_weight, o.engine])
     heading = json.dumps({"deckfix tune": hashlib.sha256(told.encode()).hexdigest()})
     try:
         lines = replays.state.read_text(encoding="utf-8").splitlines()
