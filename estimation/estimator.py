@@ -53,11 +53,8 @@ REWIND_SPAN_NS = 200_000_000
 REWIND_COUNT = 20
 """An inertial clock has gone back when this many samples over this span all are too old."""
 
-LOOK_AHEAD = 1024
-"""Events that a batch is looked through at a time."""
-
-LOOK_AHEAD_LEARNING = 32
-"""The same where the heave is learned on the way."""
+LOOK_AHEAD, FARTHEST = 32, 1024
+"""Events that a batch is looked through at a time, and how many at most where none of them comes late."""
 TAKE_UP_NS = 600_000_000
 """How long after its fixes are final a heave model is taken up by the filter."""
 NEVER = int(np.iinfo(np.int64).max)
@@ -285,13 +282,13 @@ class LandingEstimator:
         window = h.window_ns
         gap = max(window, int(self.config.imu.gap_s * 1e9))
         is_imu = r.kind == Kind.IMU
+        ahead = LOOK_AHEAD
         while i < n:
             if self._engine is None:
                 self._feed_before_start(r.take(slice(i, i + 1)))
                 i += 1
                 continue
             assert h.newest_ns is not None
-            ahead = LOOK_AHEAD if self._learning is None else LOOK_AHEAD_LEARNING
             t = r.t_ns[i : i + ahead]
             imu_here = is_imu[i : i + ahead]
             imu_t = np.where(imu_here, t, np.iinfo(np.int64).min)
@@ -302,6 +299,8 @@ class LandingEstimator:
             jump = imu_here & (t > newest + gap)
             stop = np.flatnonzero((late & ~too_old) | (too_old & imu_here) | jump)
             b = int(stop[0]) if len(stop) else len(t)
+            # What is learned on the way is to be taken up between.
+            ahead = LOOK_AHEAD if len(stop) or self._learning is not None else min(2 * ahead, FARTHEST)
             if b > 0:
                 self._insert(r.take(slice(i, i + b)), newest[:b], too_old[:b])
                 self._advance()

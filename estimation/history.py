@@ -73,11 +73,13 @@ class History:
             return np.empty(0, dtype=np.int64)
         place = self.size
         first = int(new.t_ns.min())
+        seen = bool(np.any(new.kind % REPEATED == VISION))
         if n == 1 and (place == 0 or self.rows.t_ns[place - 1] < first):
             self._reserve(place + 1)
             self.rows.write(place, new)
             self.size = place + 1
-            self._mark_repeated(place)
+            if seen:
+                self._mark_repeated(place)
             return np.empty(0, dtype=np.int64)
         if place and self.rows.t_ns[place - 1] >= first:
             place = int(np.searchsorted(self.rows.t_ns[:place], first, side="left"))
@@ -87,7 +89,8 @@ class History:
                 self.rows.make_room(place, self.size)
                 self.rows.write(place, new)
                 self.size += 1
-                self._mark_repeated(place)
+                if seen:
+                    self._mark_repeated(place)
                 self._go_back(place)
                 return np.empty(0, dtype=np.int64)
         merged = Rows.concatenate(self.rows.take(slice(place, self.size)), new) if place < self.size else new
@@ -102,7 +105,8 @@ class History:
         self._reserve(place + len(order))
         self.rows.write(place, merged.take(order))
         self.size = place + len(order)
-        self._mark_repeated(place)
+        if seen:
+            self._mark_repeated(place)
         self._go_back(first_changed)
         return left_out
 
@@ -182,7 +186,7 @@ class History:
 
     def first(self, count: int) -> Rows:
         """Return the first ``count`` rows, as they are to be told of."""
-        rows = self.rows.take(np.arange(count))
+        rows = self.rows.take(slice(0, count)).copy()
         repeated = rows.kind >= REPEATED
         rows.outcome[repeated] = Outcome.REJECTED_DUPLICATE
         rows.kind[repeated] -= REPEATED
@@ -192,8 +196,7 @@ class History:
         """Forget the first ``count`` rows."""
         for i in np.flatnonzero(self.rows.kind[:count] % REPEATED == VISION):
             self.shown[int(self.rows.sensor[i])] = self.rows.value[i, :3].tobytes()
-        rest = self.rows.take(np.arange(count, self.size))
-        self.rows.write(0, rest)
+        self.rows.write(0, self.rows.take(slice(count, self.size)).copy())
         self.size -= count
         self.done = max(0, self.done - count)
         self.checkpoints = [(i - count, s) for i, s in self.checkpoints]

@@ -143,6 +143,10 @@ class Rows:
         """Return the rows of an index: views for a slice, copies for an array."""
         return Rows(self.ints[index], self.floats[index])
 
+    def copy(self) -> Rows:
+        """Return an independent copy."""
+        return Rows(self.ints.copy(), self.floats.copy())
+
     def write(self, start: int, other: Rows) -> None:
         """Copy other rows over those that begin at ``start``."""
         self.ints[start : start + len(other)] = other.ints
