@@ -4,9 +4,9 @@ All in the logarithms of the parameters. A first sweep takes one parameter after
 since far from the truth the likelihood can be flat (a noise below what the receiver states has no effect). A damped
 Newton search goes on from there within the bounds (``estimation.heave.scoring``), with central differences of the
 likelihood of many short parts of the flights: their sum gives gradient and curvature of each parameter, the products
-of the parts' slopes how parameters answer to each other (Berndt, Hall, Hall and Hausman, 1974). At the end the Hessian
-H by central differences gives a Newton step, where that is better, and the covariance H^-1 of the logarithms
-(Bar-Shalom, Li and Kirubarajan, 2001, 2.4).
+of the parts' slopes how parameters answer to each other (Berndt, Hall, Hall and Hausman, 1974). Taken once more at the
+end, over steps of about one sigma, the curvature H gives a last step, where that is better, and the covariance H^-1 of
+the logarithms (Bar-Shalom, Li and Kirubarajan, 2001, 2.4).
 
 A weak prior (a factor of ``PRIOR`` is one sigma about the start) belongs to the objective: it decides nothing that the
 flights tell of, and keeps what they say nothing of.
@@ -27,9 +27,9 @@ from estimation.heave.scoring import Place, descend
 PRIOR = 30.0
 SWEEP = (1.0 / 10.0, 1.0 / math.sqrt(10.0), math.sqrt(10.0), 10.0)
 STEP = 0.05
-"""Step of the derivatives: smaller ones see how single measurements pass the gate, or do not."""
+"""First step of the derivatives: smaller ones see how single measurements pass the gate, or do not."""
 LEAST_STEP, LARGEST_STEP = 0.02, 0.3
-"""Steps of the Hessian: about one sigma, within these."""
+"""Further steps: about one sigma, within these."""
 AT_BOUND = 0.01
 ITERATIONS, WORTH = 30, 0.5
 """Steps of the search at most, and the gain below which it ends."""
@@ -55,8 +55,8 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Certainty:
-    """How well log-parameters are known: 1-sigma (p,), infinite where the objective is not curved; ``at_bound`` (p,)
-    those that lie on a bound, where no sigma means anything; ``information`` (p, p) the Hessian, without these."""
+    """How well log-parameters are known: 1-sigma (p,), infinite where nothing tells; ``at_bound`` (p,) those that
+    lie on a bound, where no sigma means anything; ``information`` (p, p) the curvature, without these."""
 
     sigma: Array
     at_bound: NDArray[np.bool_]
@@ -73,7 +73,7 @@ class Certainty:
         free = keep & ~self.at_bound
         out = np.zeros(len(self.sigma))
         H = self.information[np.ix_(free, free)]
-        if free.any() and np.linalg.eigvalsh(H)[0] > 0.0:
+        if free.any():
             out[free] = -np.linalg.solve(H, self.information[np.ix_(free, ~keep)] @ shift[~keep])
         moved: Array = np.clip(out[keep], -0.5, 0.5)
         return moved
@@ -115,8 +115,16 @@ class Search:
             parts = self.parts([x])
             return Place(x, float(self._objective([x], parts)[0]), parts[0])
 
+        steps = np.full(len(point), STEP)
+
+        def derivatives(place: Place[Array]) -> tuple[Array, Array]:
+            nonlocal steps
+            gradient, H = self._slopes(place, steps)
+            steps = _one_sigma(H)
+            return gradient, H
+
         end, _ = descend(
-            evaluate, self._slopes, evaluate(point), self.lower, self.upper, iterations=ITERATIONS, tolerance=WORTH
+            evaluate, derivatives, evaluate(point), self.lower, self.upper, iterations=ITERATIONS, tolerance=WORTH
         )  # fmt: skip
         return Found(end.x, end.value, self.evaluations - before)
 
@@ -125,13 +133,16 @@ class Search:
         out: Array = np.array(prior) - parts.sum(axis=1)
         return out
 
-    def _slopes(self, place: Place[Array]) -> tuple[Array, Array]:
-        """Return gradient (p,) and curvature (p, p) of the objective, by differences as far apart as the bounds allow.
+    def _slopes(self, place: Place[Array], steps: Array) -> tuple[Array, Array]:
+        """Return gradient (p,) and curvature (p, p) of the objective, by differences over ``steps`` (p,) or as far as
+        the bounds allow.
 
-        The diagonal of the curvature is that of the differences where it is positive, else of the slopes' squares.
+        The diagonal of the curvature is that of the differences where it is positive, else of the slopes' squares; how
+        parameters answer to each other is the correlation of the slopes. So it is positive definite, where second
+        differences of a likelihood that is rough need not be.
         """
         n = len(place.x)
-        down, up = np.maximum(place.x - STEP, self.lower), np.minimum(place.x + STEP, self.upper)
+        down, up = np.maximum(place.x - steps, self.lower), np.minimum(place.x + steps, self.upper)
         points = [_moved(place.x, k, to[k] - place.x[k]) for k in range(n) for to in (down, up)]
         parts = self.parts(points).reshape(n, 2, -1)
         before, after = (place.x - down)[:, None], (up - place.x)[:, None]
@@ -166,15 +177,12 @@ class Search:
         information = np.zeros((n, n))
         if not len(free):
             return found, Certainty(np.full(n, np.inf), at_bound, information)
-        room = np.minimum(x - self.lower, self.upper - x)
-        _, curvature = self._derivatives(x, found.value, np.minimum(STEP, room), free)
-        wanted = np.clip(1.0 / np.sqrt(np.maximum(curvature, 1e-9)), LEAST_STEP, LARGEST_STEP)
-        steps = np.minimum(wanted, room)
-        H, gradient = self._hessian(x, found.value, steps, free)
-        information[np.ix_(free, free)] = H
+        place = Place(x, found.value, self.parts([x])[0])
+        _, near = self._slopes(place, np.full(n, STEP))
+        gradient, H = self._slopes(place, _one_sigma(near))
+        information[np.ix_(free, free)] = H[np.ix_(free, free)]
         shift = np.zeros(n)
-        if np.linalg.eigvalsh(H)[0] > 0.0:
-            shift[free] = -np.linalg.solve(H, gradient)
+        shift[free] = -np.linalg.solve(H[np.ix_(free, free)], gradient[free])
         y = np.clip(x + np.clip(shift, -0.5, 0.5), self.lower, self.upper)
         value = float(self.values([y])[0])
         better = Found(y, value, self.evaluations) if value < found.value else found
@@ -194,34 +202,6 @@ class Search:
                 point, value = tried[best], float(values[best])
         return point
 
-    def _derivatives(
-        self, x: Array, value: float, steps: Array, which: NDArray[np.int64] | None = None
-    ) -> tuple[Array, Array]:
-        """Return first and second derivatives (p,) by central differences, 0 where not asked for."""
-        chosen = np.arange(len(x)) if which is None else which
-        inner = np.clip(x, self.lower + steps, self.upper - steps)
-        points = [_moved(inner, k, s * steps[k]) for k in chosen for s in (1.0, -1.0)]
-        values = self.values(points).reshape(-1, 2)
-        first, second = np.zeros(len(x)), np.zeros(len(x))
-        h = steps[chosen]
-        first[chosen] = (values[:, 0] - values[:, 1]) / (2.0 * h)
-        second[chosen] = (values[:, 0] - 2.0 * value + values[:, 1]) / h**2
-        return first, second
-
-    def _hessian(self, x: Array, value: float, steps: Array, free: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return the Hessian (f, f) and gradient (f,) by the f free parameters."""
-        f = len(free)
-        h = steps[free]
-        single = [_moved(x, k, s * steps[k]) for k in free for s in (1.0, -1.0)]
-        pairs = [(a, b) for a in range(f) for b in range(a)]
-        double = [_moved(_moved(x, free[a], h[a]), free[b], h[b]) for a, b in pairs]
-        values = self.values([*single, *double])
-        one, two = values[: 2 * f].reshape(f, 2), values[2 * f :]
-        H = np.diag((one[:, 0] - 2.0 * value + one[:, 1]) / h**2)
-        for (a, b), both in zip(pairs, two, strict=True):
-            H[a, b] = H[b, a] = (both - one[a, 0] - one[b, 0] + value) / (h[a] * h[b])
-        return H, (one[:, 0] - one[:, 1]) / (2.0 * h)
-
 
 def _moved(x: Array, k: int | np.int64, by: float) -> Array:
     y = x.copy()
@@ -229,16 +209,14 @@ def _moved(x: Array, k: int | np.int64, by: float) -> Array:
     return y
 
 
-def _sigmas(H: Array, free: NDArray[np.bool_]) -> Array:
-    """Return sigmas (p,) of the free parameters from the Hessian (p, p).
+def _one_sigma(curvature: Array) -> Array:
+    """Return steps (p,) of about one sigma."""
+    return np.clip(1.0 / np.sqrt(np.diag(curvature)), LEAST_STEP, LARGEST_STEP)
 
-    Where it is not positive, from the largest part of it that is; infinite for the others.
-    """
-    order = np.argsort(-np.diag(H))
-    kept = [int(k) for k in order if free[k]]
-    while kept and np.linalg.eigvalsh(H[np.ix_(kept, kept)])[0] <= 0.0:
-        kept.pop()
-    sigma = np.full(len(H), np.inf)
-    if kept:
-        sigma[kept] = np.sqrt(np.diag(np.linalg.inv(H[np.ix_(kept, kept)])))
+
+def _sigmas(curvature: Array, free: NDArray[np.bool_]) -> Array:
+    """Return sigmas (p,) of the free parameters from the curvature (p, p), infinite for the others."""
+    sigma = np.full(len(curvature), np.inf)
+    if free.any():
+        sigma[free] = np.sqrt(np.diag(np.linalg.inv(curvature[np.ix_(free, free)])))
     return sigma
