@@ -187,7 +187,7 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
             found, certainty = search.certainty(min(ends, key=lambda e: e.value))
         else:
             assert certainty is not None
-            # What is put back was not identified: the others answer to it as the Hessian says.
+            # What is put back was not identified: the others answer to it as the curvature says.
             places = [point[free], np.clip(point[free] + answer, lower[free], upper[free])]
             values = search.values(places)
             best = int(np.argmin(values))
