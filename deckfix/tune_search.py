@@ -27,9 +27,9 @@ from estimation.heave.scoring import Place, descend
 PRIOR = 30.0
 SWEEP = (1.0 / 10.0, 1.0 / math.sqrt(10.0), math.sqrt(10.0), 10.0)
 STEP = 0.05
-"""First step of the derivatives: smaller ones see how single measurements pass the gate, or do not."""
-LEAST_STEP, LARGEST_STEP = 0.02, 0.3
-"""Further steps: about one sigma, within these."""
+"""First and smallest step of the derivatives: smaller ones see how single measurements pass the gate, or do not."""
+LARGEST_STEP = 0.3
+"""Further steps are about one sigma, up to this."""
 AT_BOUND = 0.01
 ITERATIONS, WORTH = 30, 0.5
 """Steps of the search at most, and the gain below which it ends."""
@@ -211,7 +211,7 @@ def _moved(x: Array, k: int | np.int64, by: float) -> Array:
 
 def _one_sigma(curvature: Array) -> Array:
     """Return steps (p,) of about one sigma."""
-    return np.clip(1.0 / np.sqrt(np.diag(curvature)), LEAST_STEP, LARGEST_STEP)
+    return np.clip(1.0 / np.sqrt(np.diag(curvature)), STEP, LARGEST_STEP)
 
 
 def _sigmas(curvature: Array, free: NDArray[np.bool_]) -> Array:
