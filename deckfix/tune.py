@@ -192,7 +192,7 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
             values = search.values(places)
             best = int(np.argmin(values))
             if values[best] < found.value + EDGE * np.count_nonzero(~keep):
-                found, certainty = Found(places[best], float(values[best]), 0), certainty.kept(keep)
+                found, certainty = Found(places[best], float(values[best])), certainty.kept(keep)
             else:
                 found, certainty = search.certainty(search.run(places[best], sweep=False))
         evaluations += search.evaluations

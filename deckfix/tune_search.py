@@ -2,7 +2,7 @@
 
 All in the logarithms of the parameters. A first sweep takes one parameter after the other to the best of a few factors,
 since far from the truth the likelihood can be flat (a noise below what the receiver states has no effect). A damped
-Newton search goes on from there within the bounds (``estimation.heave.scoring``), with central differences of the
+Newton search goes on from there within the bounds (``estimation.scoring``), with central differences of the
 likelihood of many short parts of the flights: their sum gives gradient and curvature of each parameter, the products
 of the parts' slopes how parameters answer to each other (Berndt, Hall, Hall and Hausman, 1974). Taken once more at the
 end, over steps of about one sigma, the curvature H gives a last step, where that is better, and the covariance H^-1 of
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.frames import Array
-from estimation.heave.scoring import Place, descend
+from estimation.scoring import Place, descend
 
 PRIOR = 30.0
 SWEEP = (1.0 / 10.0, 1.0 / math.sqrt(10.0), math.sqrt(10.0), 10.0)
@@ -46,17 +46,16 @@ Objective = Callable[[Sequence[Array]], list[Array]]
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Where a search ended: log-parameters (p,), the objective there with its prior, and evaluations used."""
+    """Where a search ended: log-parameters (p,), and the objective there with its prior."""
 
     point: Array
     value: float
-    evaluations: int
 
 
 @dataclass(frozen=True, slots=True)
 class Certainty:
-    """How well log-parameters are known: 1-sigma (p,), infinite where nothing tells; ``at_bound`` (p,) those that
-    lie on a bound, where no sigma means anything; ``information`` (p, p) the curvature, without these."""
+    """How well log-parameters are known: 1-sigma (p,), infinite on a bound, where none means
+    anything; ``at_bound`` (p,) those that lie on one; ``information`` (p, p) the curvature, without these."""
 
     sigma: Array
     at_bound: NDArray[np.bool_]
@@ -106,7 +105,6 @@ class Search:
 
     def run(self, start: Array, sweep: bool = True) -> Found:
         """Return where the search from a start ends."""
-        before = self.evaluations
         point = np.clip(start, self.lower, self.upper)
         if sweep:
             point = self._swept(point)
@@ -126,7 +124,7 @@ class Search:
         end, _ = descend(
             evaluate, derivatives, evaluate(point), self.lower, self.upper, iterations=ITERATIONS, tolerance=WORTH
         )  # fmt: skip
-        return Found(end.x, end.value, self.evaluations - before)
+        return Found(end.x, end.value)
 
     def _objective(self, points: Sequence[Array], parts: Array) -> Array:
         prior = [0.5 * float(np.sum((p - self.centre) ** 2)) / math.log(PRIOR) ** 2 for p in points]
@@ -185,7 +183,7 @@ class Search:
         shift[free] = -np.linalg.solve(H[np.ix_(free, free)], gradient[free])
         y = np.clip(x + np.clip(shift, -0.5, 0.5), self.lower, self.upper)
         value = float(self.values([y])[0])
-        better = Found(y, value, self.evaluations) if value < found.value else found
+        better = Found(y, value) if value < found.value else found
         return better, Certainty(_sigmas(information, ~at_bound), at_bound, information)
 
     def _swept(self, point: Array) -> Array:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation.heave.scoring import Place, descend
+from estimation.scoring import Place, descend
 
 Array = NDArray[np.float64]
 

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from estimation.heave.basis import Basis, dense_basis
 from estimation.heave.regression import Evidence, Regression, compress, information, posterior
-from estimation.heave.scoring import Place, descend
 from estimation.heave.series import Window
+from estimation.scoring import Place, descend
 
 Array = NDArray[np.float64]
 Density = Callable[[Array], Array]

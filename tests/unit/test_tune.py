@@ -20,7 +20,7 @@ from deckfix.tune_search import Search
 from estimation.config import Config, dump_config, load_config, parse_config
 from estimation.events import Event, EventBatch, GpsVelocity, Kind
 from estimation.frames import Array
-from estimation.heave.scoring import Place
+from estimation.scoring import Place
 from logs.events import series_of_batch
 from logs.writer import FlightWriter
 

@@ -9,8 +9,8 @@ from scipy.optimize import minimize
 
 from estimation.heave.basis import dense_basis, phasors
 from estimation.heave.regression import compress, information, posterior
-from estimation.heave.scoring import Place, descend
 from estimation.heave.series import Window, cut_window
+from estimation.scoring import Place, descend
 
 Array = NDArray[np.float64]
 

@@ -1,8 +1,8 @@
 """Fisher's scoring within bounds: the largest posterior of parameters whose expected information is known.
 
-Newton's method with the expected information in the place of the Hessian (Jennrich and Sampson, 1976): it is positive
-definite wherever the search stands, so that every step goes downhill. A step that does not gain is damped after
-Levenberg and Marquardt; parameters on a bound that the slope holds there stay out of it.
+Newton's method with the expected information in the place of the Hessian (Jennrich and Sampson, 1976), or with another
+curvature that, like it, is positive definite wherever the search stands, so that every step goes downhill. A step that
+does not gain is damped after Levenberg and Marquardt; parameters on a bound that the slope holds there stay out of it.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ def descend(
             step[free] = np.linalg.solve(damped, -gradient[free])
             x = np.clip(at.x + step, low, high)
             step = x - at.x
+            # Less than nothing is promised where a bound has cut the step: a shorter one goes downhill again.
             promised = -float(gradient @ step + 0.5 * step @ H @ step)
             if 0.0 <= promised < tolerance:
                 break
@@ -73,11 +74,11 @@ def descend(
                 evaluated += 1
                 gained = at.value - there.value
                 if gained > 0.0:
-                    damping *= (
-                        1.0 / MORE if gained > 0.5 * promised else MORE if gained < 0.1 * promised else 1.0
-                    )
-                    damping = max(damping, LEAST_DAMPING)
                     at = there
+                    if gained > 0.5 * promised:
+                        damping = max(damping / MORE, LEAST_DAMPING)
+                    elif gained < 0.1 * promised:
+                        damping *= MORE
                     break
             damping *= MORE
         if gained <= 0.0:
