@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deckfix._version import __version__
 from deckfix.commands import write_text
@@ -161,7 +162,7 @@ def run_tune(
 
 
 def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
-    """Return the values of all parameters, those that are not identified as they were, and the certainty."""
+    """Return the values of all parameters, those of which the flights tell nothing as they were, and the certainty."""
     parameters = replays.parameters
     centre = np.log([p.start for p in parameters])
     lower, upper = np.log([p.lower for p in parameters]), np.log([p.upper for p in parameters])
@@ -195,11 +196,12 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
                 found, certainty = Found(places[best], float(values[best])), certainty.kept(keep)
             else:
                 found, certainty = search.certainty(search.run(places[best], sweep=False))
-        evaluations += search.evaluations
         point[free] = found.point
         sigma[:], at_bound[:] = np.inf, False
         sigma[free], at_bound[free] = certainty.sigma, certainty.at_bound
         keep = certainty.identified | certainty.at_bound
+        keep |= _limited(search, found, certainty, keep)
+        evaluations += search.evaluations
         if keep.all():
             break
         answer = certainty.answer(keep, centre[free] - point[free])
@@ -214,6 +216,25 @@ def _searched(replays: _Replays) -> tuple[list[float], Certainty, int]:
     rounded = [float(f"{v:.{DIGITS}g}") for v in np.exp(values)]
     whole = [p.start if k not in free else rounded[k] for k, p in enumerate(parameters)]
     return whole, Certainty(sigma, at_bound, certainty.information), evaluations * len(replays.paths)
+
+
+def _limited(
+    search: Search, found: Found, certainty: Certainty, keep: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return which parameters besides those to ``keep`` are known by a limit: flat where the search ended, and yet
+    putting one of them back to where it was costs more than ``EDGE``, also where the others answer to it."""
+    places, which = list[Array](), np.flatnonzero(~keep)
+    for k in which:
+        others = np.arange(len(keep)) != k
+        back = found.point.copy()
+        back[k] = search.centre[k]
+        answered = back.copy()
+        answered[others] += certainty.answer(others, back - found.point)
+        places += [back, np.clip(answered, search.lower, search.upper)]
+    out = np.zeros(len(keep), dtype=bool)
+    if places:
+        out[which] = search.values(places).reshape(-1, 2).min(axis=1) > found.value + EDGE
+    return out
 
 
 def _first(replays: _Replays, files: Sequence[str], remarks: list[str]) -> list[Score | Refused]:

@@ -112,10 +112,18 @@ def _lines(tuned: Tuned) -> Iterator[str]:
                 f"  {p.name:{width}s} {p.start:.4g} -> {value:.4g} {p.unit}: at its bound, so the flights want it "
                 "beyond; what it stands for may be missing in the model"
             )
+        elif value != p.start:
+            side = "larger" if value < p.start else "smaller"
+            yield (
+                f"  {p.name:{width}s} {p.start:.4g} -> {value:.4g} {p.unit}: only a limit is known, it may not be much "
+                f"{side}; {p.meaning}"
+            )
     unknown = [
         p.name
-        for p, k, b in zip(tuned.parameters, known, tuned.certainty.at_bound, strict=True)
-        if not (k or b)
+        for p, value, k, b in zip(
+            tuned.parameters, tuned.values, known, tuned.certainty.at_bound, strict=True
+        )
+        if not (k or b) and value == p.start
     ]
     if unknown:
         yield f"  not identified, left as they were: {', '.join(unknown)}"

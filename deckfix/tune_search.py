@@ -170,7 +170,7 @@ class Search:
     def certainty(self, found: Found) -> tuple[Found, Certainty]:
         """Return what a Newton step from the end of a search gives, where it is better, and how certain it is."""
         x, n = found.point, len(found.point)
-        at_bound = (x - self.lower < AT_BOUND) | (self.upper - x < AT_BOUND)
+        at_bound = self._at_bound(x)
         free = np.flatnonzero(~at_bound)
         information = np.zeros((n, n))
         if not len(free):
@@ -178,13 +178,22 @@ class Search:
         place = Place(x, found.value, self.parts([x])[0])
         _, near = self._slopes(place, np.full(n, STEP))
         gradient, H = self._slopes(place, _one_sigma(near))
-        information[np.ix_(free, free)] = H[np.ix_(free, free)]
         shift = np.zeros(n)
         shift[free] = -np.linalg.solve(H[np.ix_(free, free)], gradient[free])
         y = np.clip(x + np.clip(shift, -0.5, 0.5), self.lower, self.upper)
-        value = float(self.values([y])[0])
-        better = Found(y, value) if value < found.value else found
-        return better, Certainty(_sigmas(information, ~at_bound), at_bound, information)
+        parts = self.parts([y])
+        value = float(self._objective([y], parts)[0])
+        if value < found.value:
+            found = Found(y, value)
+            _, H = self._slopes(Place(y, value, parts[0]), _one_sigma(H))
+            at_bound = self._at_bound(y)
+            free = np.flatnonzero(~at_bound)
+        information[np.ix_(free, free)] = H[np.ix_(free, free)]
+        return found, Certainty(_sigmas(information, ~at_bound), at_bound, information)
+
+    def _at_bound(self, x: Array) -> NDArray[np.bool_]:
+        at_bound: NDArray[np.bool_] = (x - self.lower < AT_BOUND) | (self.upper - x < AT_BOUND)
+        return at_bound
 
     def _swept(self, point: Array) -> Array:
         value = float(self.values([point])[0])

@@ -13,9 +13,9 @@ from small_flight import small_events, small_log, small_recording
 from deckfix import tune as tune_module
 from deckfix.cli import main
 from deckfix.files import InputError, OutputError
-from deckfix.tune import STATE, TuneOptions, run_tune
+from deckfix.tune import STATE, TuneOptions, _searched, run_tune
 from deckfix.tune_objective import FAULTY, PARTS, Refused, Score, Trial, density, score
-from deckfix.tune_parameters import DEFAULTS, choose, factor_in_words, with_values
+from deckfix.tune_parameters import DEFAULTS, Parameter, choose, factor_in_words, with_values
 from deckfix.tune_search import Search
 from estimation.config import Config, dump_config, load_config, parse_config
 from estimation.events import Event, EventBatch, GpsVelocity, Kind
@@ -381,3 +381,43 @@ def test_slopes_are_those_of_the_likelihood_also_on_a_bound(place: list[float]) 
     np.testing.assert_allclose(gradient, np.array(wanted) + prior, atol=0.03 * float(np.diag(H).max()))
     assert H[0, 1] == H[1, 0]
     assert np.linalg.eigvalsh(H)[0] > 0.0
+
+
+class _Sample:
+    """A sample whose variance is 1 and the square of the first noise; nothing depends on the others."""
+
+    paths = ("a flight",)
+    options = TuneOptions(starts=1)
+
+    def __init__(self, first: float) -> None:
+        names = ("imu.gyro_noise", "imu.accel_noise", "barometer.sigma_m")
+        starts = (first, 2.0, 1.0)
+        self.parameters = [
+            Parameter(n, s, s / 1000.0, s * 100.0, "-", "") for n, s in zip(names, starts, strict=True)
+        ]
+        squares = np.random.default_rng(6).standard_normal(400) ** 2
+        self.squares = 0.8 * squares / squares.mean()
+
+    def objective(
+        self, fixed: tuple[tuple[str, float], ...], free: list[str], points: Sequence[Array]
+    ) -> list[Array]:
+        out = []
+        for p in points:
+            values = dict(fixed) | dict(zip(free, np.exp(p), strict=True))
+            variance = 1.0 + values["imu.gyro_noise"] ** 2
+            out.append(-0.5 * np.log(variance) - 0.5 * self.squares / variance)
+        return out
+
+
+def test_a_noise_of_which_only_a_limit_is_known_is_not_put_back() -> None:
+    """The noise hides below a larger one: it may be anything but what it started as."""
+    values, certainty, _ = _searched(_Sample(8.0))  # type: ignore[arg-type]
+    assert values[0] < 0.5
+    assert not certainty.identified[0]
+    assert not certainty.at_bound[0]
+    assert values[1:] == [2.0, 1.0]
+
+
+def test_a_noise_that_started_below_its_limit_is_left_where_it_was() -> None:
+    with pytest.raises(InputError, match="no parameter can be identified"):
+        _searched(_Sample(0.05))  # type: ignore[arg-type]
