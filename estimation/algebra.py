@@ -15,10 +15,12 @@ def cross_covariance(P: Array, H: Array, m: int) -> Array:
     """Return P H', (n, 3) of which m columns are used."""
     n = P.shape[0]
     PHt = np.zeros((n, 3))
-    for i in range(n):
-        for j in range(m):
-            for k in range(n):
-                PHt[i, j] += P[i, k] * H[j, k]
+    for j in range(m):
+        for k in range(n):
+            h = H[j, k]
+            if h != 0.0:
+                for i in range(n):
+                    PHt[i, j] += P[i, k] * h
     return PHt
 
 
@@ -100,21 +102,27 @@ def joseph(P: Array, K: Array, H: Array, R: Array, scale: float, m: int) -> None
         for i in range(n):
             for c in range(n):
                 B[i, c] -= K[i, j] * HP[c]
-    # Columns: B (I - KH)' = B - (B H') K'; then the noise.
-    C = np.zeros((n, 3))
-    for i in range(n):
-        for j in range(m):
-            for k in range(n):
-                C[i, j] -= B[i, k] * H[j, k]
+    # Columns: B (I - KH)' = B - (B H') K'; then the noise. Few columns of H have an entry.
+    C, turned = np.zeros((n, 3)), np.empty((3, n))
+    for j in range(m):
+        for k in range(n):
+            h = H[j, k]
+            if h != 0.0:
+                for i in range(n):
+                    C[i, j] -= B[i, k] * h
+        for i in range(n):
+            turned[j, i] = K[i, j]
             for k in range(m):
                 C[i, j] += scale * K[i, k] * R[k, j]
     for i in range(n):
-        for c in range(n):
-            for j in range(m):
-                B[i, c] += C[i, j] * K[c, j]
+        for j in range(m):
+            for c in range(n):
+                B[i, c] += C[i, j] * turned[j, c]
     for i in range(n):
-        for c in range(n):
-            P[i, c] = 0.5 * (B[i, c] + B[c, i])
+        for c in range(i + 1):
+            mean = 0.5 * (B[i, c] + B[c, i])
+            P[i, c] = mean
+            P[c, i] = mean
 
 
 def reset_attitude(P: Array, G: Array, att: int) -> None:
@@ -151,5 +159,6 @@ def congruence(A: Array, P: Array, out: Array) -> None:
         for j in range(m):
             value = 0.0
             for k in range(n):
-                value += AP[i, k] * A[j, k]
+                if A[j, k] != 0.0:
+                    value += AP[i, k] * A[j, k]
             out[i, j] = value
