@@ -222,7 +222,8 @@ def _limited(
     search: Search, found: Found, certainty: Certainty, keep: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Return which parameters besides those to ``keep`` are known by a limit: flat where the search ended, and yet
-    putting one of them back to where it was costs more than ``EDGE``, also where the others answer to it."""
+    putting one of them back to where it was costs more than ``EDGE``, also where the others answer to it.
+    """
     places, which = list[Array](), np.flatnonzero(~keep)
     for k in which:
         others = np.arange(len(keep)) != k
